@@ -18,7 +18,7 @@ from support.soak import hardest
 wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
 """Tasks whose kernels many files use, in addition to `hold_height`."""
-MUJOCO = """
+MUJOCO_STEP = """
 import warp as wp
 from jumper_warp.sim.simulation import Simulation
 wp.config.log_level = wp.LOG_WARNING
@@ -27,10 +27,10 @@ Simulation(2, solver="mujoco", visuals=False, device="cpu").step()
 
 
 def pytest_sessionstart(session):
-    """Compile the kernels of most files before workers start, if there are several and the whole suite runs."""
+    """Compile the kernels of most files before pytest's workers start, if several workers run the whole suite."""
     options = session.config.option
     if (getattr(options, "numprocesses", None) or 0) > 1 and not options.file_or_dir:
-        with subprocess.Popen([sys.executable, "-c", MUJOCO]):
+        with subprocess.Popen([sys.executable, "-c", MUJOCO_STEP]):  # at the same time
             for name in SHARED:
                 Env(hardest(make_task(name)), 2, device="cpu").compile()  # with a small map
             Env(hold_height(), 2, device="cpu").compile()

@@ -11,7 +11,7 @@ from jumper_warp import mdp
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_curriculum_counts_every_episode_by_default():
+def test_curriculum_counts_every_episode_by_default():
     curriculum = mdp.Curriculum(hold_height.height_error, tolerance=0.1)
     assert curriculum.options["counts"].func(None) is True
 

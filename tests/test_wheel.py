@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = ("jumper_warp", "kernels", "assets", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 BUILD = "from setuptools.build_meta import build_wheel; print(build_wheel('.'))"
 INSTALL = ("-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
-USE = """
+USE_PACKAGE = """
 import jumper_warp
 from jumper_warp.cli.main import main
 from jumper_warp.policies.runs import load_policy
@@ -29,7 +29,7 @@ load_description()
 for name in policy_tasks():
     load_policy(name)  # checks every file
 """
-BOTH = """
+PRINT_BOTH = """
 import kernels, jumper_warp.kernels.scalar
 print(kernels.OWNER, kernels.__file__, jumper_warp.kernels.scalar.__file__)
 """
@@ -85,7 +85,7 @@ def test_installed_package_finds_assets_and_policies_from_another_folder(wheel, 
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     zipfile.ZipFile(wheel).extractall(site)
     elsewhere.mkdir()
-    package, *listed = run(USE, elsewhere, site)
+    package, *listed = run(USE_PACKAGE, elsewhere, site)  # its path, and the JSON of `jumper list`
     assert Path(package).is_relative_to(site)
     assert [policy["name"] for policy in json.loads("\n".join(listed))["policies"]] == list(policy_tasks())
 
@@ -96,7 +96,7 @@ def test_package_named_kernels_of_another_project_can_be_installed_too(wheel, ot
     for path in (wheel, other_wheel) if ours_first else (other_wheel, wheel):
         returncode, _, errors = python(*INSTALL, "--target", str(site), str(path), folder=tmp_path)
         assert returncode == 0 and "already exists" not in errors, errors
-    (printed,) = run(BOTH, tmp_path, site)
+    (printed,) = run(PRINT_BOTH, tmp_path, site)
     inside = (str(site / "kernels" / "__init__.py"), str(site / "jumper_warp" / "kernels" / "scalar.py"))
     assert printed == " ".join(("other", *inside))
 

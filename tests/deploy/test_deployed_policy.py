@@ -12,7 +12,9 @@ import numpy as np
 import onnx
 import pytest
 
+from columns import ANG_VEL, QUAT, XY, X, Y, Z
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.onnx import export_onnx
@@ -25,7 +27,7 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorials" / "on_a_robot.md"
-COMMAND_STEP = 30  # policy step of the command to jump
+COMMAND_STEP, HEIGHT = 30, 0.9  # policy step of the command to jump; commanded base height [m]
 
 
 def without_history(policy, readings):
@@ -59,11 +61,11 @@ def onnx_of(name):
 def robot_readings(robot):
     """Return the readings of a simulated robot that every policy takes."""
     q, qd = robot.joint_q()[0], robot.joint_qd()[0]
-    to_body = q[3:7] * CONJUGATE
+    to_body = q[QUAT] * CONJUGATE
     return {
-        "height": q[2],
+        "height": q[Z],
         "lin_vel": rotate(to_body, robot.base_velocity()[0]),
-        "ang_vel": rotate(to_body, qd[3:6]),
+        "ang_vel": rotate(to_body, qd[ANG_VEL]),
         "gravity": rotate(to_body, np.array([0.0, 0.0, -1.0])),
         "angle": motor_values(q[7:]),
         "rate": motor_values(qd[6:]),
@@ -78,9 +80,9 @@ def paws_down(robot):
 def way_to(place, robot):
     """Return the way from the base to a position in the world [m], ahead and to the left."""
     q = robot.joint_q()[0]
-    ahead = rotate(q[3:7], np.array([1.0, 0.0, 0.0]))
-    yaw = np.arctan2(ahead[1], ahead[0])
-    x, y = place - q[:2]
+    ahead = rotate(q[QUAT], np.array([1.0, 0.0, 0.0]))
+    yaw = np.arctan2(ahead[Y], ahead[X])
+    x, y = place - q[XY]
     return np.array([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x])
 
 
@@ -91,20 +93,21 @@ def simulated_robot(lateral_torque):
 
 
 def test_jump_to_a_height_reaches_it():
-    assert jump()[0] == pytest.approx(0.9, abs=0.0005)  # [m]
+    apex, _ = jump()
+    assert apex == pytest.approx(HEIGHT, abs=0.0005)  # [m]
 
 
 def test_jump_to_a_place_ends_there():
     policy, robot = onnx_of("horizontal_jump"), simulated_robot(12.0)
-    place = robot.joint_q()[0, :2] + [0.8, 0.2]
-    for tick in range(180):
+    place = robot.joint_q()[0, XY] + [0.8, 0.2]  # [m]
+    for tick in range(180):  # 3 s
         goal = way_to(place, robot) if tick >= COMMAND_STEP else np.zeros(2)
         robot.set_targets(policy.targets({**robot_readings(robot), "goal": goal}))
         robot.step()
-    assert np.linalg.norm(robot.joint_q()[0, :2] - place) < 0.03  # [m]
+    assert np.linalg.norm(robot.joint_q()[0, XY] - place) < 0.03  # [m]
 
 
-def test_interface_has_the_observation_layout():
+def test_interface_has_first_column_end_and_history_of_each_observation_term():
     layout = onnx_of("horizontal_jump").interface["observation_layout"]
     assert [f"{name} {term['first']} {term['end']} {term['history']}" for name, term in layout.items()] == [
         "goal 0 2 1", "height 2 3 1", "lin_vel 3 15 4", "ang_vel 15 27 4", "gravity 27 39 4", "angle 39 87 4",
@@ -117,19 +120,20 @@ def test_interface_has_the_observation_layout():
     [("vertical_jump", (0.0, 0.0, 0.9), 0.5), ("horizontal_jump", (0.8, 0.2, 0.0), 1.0)],
 )
 def test_observations_actions_and_targets_agree_with_the_environment(name, goal, heading):
+    """The environment's policy drives one robot through a jump, whose readings the deployed policy gets each step."""
     policy, deployed, command = load_policy(name), onnx_of(name), JumpCommand()
     env = env_of_policy(policy, 1, Conditions(device="cpu"))
     env.evaluation_reset([[*goal, COMMAND_STEP]], heading)
-    goal_position = env.task_arrays()["goal"][0, :2]
+    goal_position = env.task_arrays()["goal"][0, XY]
     errors, frame_difference = np.zeros(3), 0.0
     for tick in range(150):
         readings = robot_readings(env.sim)
         velocity = env.sim.base_velocity()[0]
         if tick == COMMAND_STEP:
             command.request()
-        jump_command = command.update(velocity[2], paws_down(env.sim))
+        jump_command = command.update(velocity[Z], paws_down(env.sim))
         to_goal = way_to(goal_position, env.sim) if tick >= COMMAND_STEP else np.zeros(2)
-        task_readings = {"wanted_height": goal[2], "jump_command": jump_command} if goal[2] else {"goal": to_goal}
+        task_readings = {"wanted_height": goal[Z], "jump_command": jump_command} if goal[Z] else {"goal": to_goal}
         obs = deployed.observe(readings | task_readings)
         action, expected = deployed.act(obs), policy.act(env.obs)
         target = deployed.default + deployed.scale * action
@@ -142,13 +146,13 @@ def test_observations_actions_and_targets_agree_with_the_environment(name, goal,
         env_target = env.robot.filtered_target.numpy()[:, 0]
         pairs = ((obs, env_obs), (action, expected[0].numpy()), (filtered, env_target))
         errors = np.maximum(errors, [np.abs(a - b).max() for a, b in pairs])
-    assert env.task_arrays()["phase"][0] == 2 and (command.requested, command.in_flight) == (False, False)
+    assert env.task_arrays()["phase"][0] == LANDED and (command.requested, command.in_flight) == (False, False)
     assert errors.max() < 3.0e-5, errors  # [SI]; rounding of body axes in float32 and of ONNX's sums
     assert frame_difference > 0.05  # [m/s] so large that world axes would exceed the tolerance
 
 
 def jump(change=None, delay=0, ticks=180):
-    """Return apex [m] and number of takeoffs of a vertical jump to 0.9 m.
+    """Return apex [m] and number of takeoffs of a vertical jump commanded to HEIGHT.
 
     change: function of policy and readings that returns the readings to use; delay: policy steps by which the end of
     the jump command is delayed; ticks: policy steps to simulate.
@@ -158,34 +162,36 @@ def jump(change=None, delay=0, ticks=180):
     for tick in range(ticks):
         if tick == COMMAND_STEP:
             command.request()
-        up, down = robot.base_velocity()[0, 2], paws_down(robot)
+        up, down = robot.base_velocity()[0, Z], paws_down(robot)
         commands.append(command.update(up, down))
         readings = robot_readings(robot)
         if change is not None:
             readings = change(policy, readings)
-        task_readings = {"wanted_height": 0.9, "jump_command": max(commands[-1 - delay :])}
+        task_readings = {"wanted_height": HEIGHT, "jump_command": max(commands[-1 - delay :])}
         robot.set_targets(policy.targets(readings | task_readings))
         robot.step()
-        takeoff = not in_flight and down == 0 and up > 0.75
+        takeoff = not in_flight and down == 0 and up > 0.75  # [m/s]
         in_flight, takeoffs = down == 0 and (in_flight or takeoff), takeoffs + takeoff
-        apex = max(apex, robot.joint_q()[0, 2])
+        apex = max(apex, robot.joint_q()[0, Z])
     return apex, takeoffs
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_change_the_apex_as_documented(mistake):
-    change, apex = MISTAKES[mistake]
-    assert jump(change)[0] == pytest.approx(apex, abs=0.02)  # [m]
+    change, documented = MISTAKES[mistake]
+    apex, _ = jump(change)
+    assert apex == pytest.approx(documented, abs=0.02)  # [m]
 
 
 def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff():
-    apex, takeoffs = jump(delay=9, ticks=480)
-    assert apex == pytest.approx(0.9, abs=0.005) and takeoffs == 1
+    apex, takeoffs = jump(delay=9, ticks=480)  # policy steps of 1/60 s
+    assert apex == pytest.approx(HEIGHT, abs=0.005) and takeoffs == 1
 
 
-@pytest.mark.parametrize(("delay", "takeoffs"), [(12, 2), (480, 8)])  # 3 and 9 on another machine
-def test_command_that_stays_set_makes_the_robot_jump_again(delay, takeoffs):
-    assert jump(delay=delay, ticks=480)[1] >= takeoffs
+@pytest.mark.parametrize(("delay", "least"), [(12, 2), (480, 8)])  # takeoffs, 3 and 9 on another machine
+def test_command_that_stays_set_makes_the_robot_jump_again(delay, least):
+    _, takeoffs = jump(delay=delay, ticks=480)
+    assert takeoffs >= least
 
 
 def test_history_starts_with_the_first_reading_and_shifts_each_step():
@@ -194,13 +200,14 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step():
         "wanted_height": 0.9, "jump_command": 0.0, "height": 0.3, "lin_vel": [1.0, 2.0, 3.0], "ang_vel": np.zeros(3),
         "gravity": [0.0, 0.0, -1.0], "angle": policy.default, "rate": np.zeros(12),
     }  # fmt: skip
-    np.testing.assert_array_equal(policy.observe(readings)[3:15], [1.0, 2.0, 3.0] * 4)  # lin_vel, 4 frames
+    lin_vel, last_action = slice(3, 15), slice(99, 147)  # columns, 4 frames each
+    np.testing.assert_array_equal(policy.observe(readings)[lin_vel], [1.0, 2.0, 3.0] * 4)
     policy.act(policy.observe(readings | {"lin_vel": [4.0, 5.0, 6.0]}))
     obs = policy.observe(readings | {"lin_vel": [7.0, 8.0, 9.0]})
-    np.testing.assert_array_equal(obs[3:15], [1.0, 2.0, 3.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    np.testing.assert_array_equal(obs[99:147], [*np.zeros(36), *policy.action])  # last_action, 4 frames of 12
+    np.testing.assert_array_equal(obs[lin_vel], [1.0, 2.0, 3.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(obs[last_action], [*np.zeros(36), *policy.action])  # the newest frame of 12 is last
     policy.reset()
-    np.testing.assert_array_equal(policy.observe(readings)[99:147], np.zeros(48))
+    np.testing.assert_array_equal(policy.observe(readings)[last_action], np.zeros(48))
 
 
 def zero_readings(policy):
@@ -223,7 +230,7 @@ def test_refuses_a_reading_that_is_not_finite_and_continues_with_the_next(value)
     np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
 
 
-@pytest.mark.parametrize("values", [(math.nan, 4), (0.0, math.nan)])
+@pytest.mark.parametrize("values", [(math.nan, 4), (0.0, math.nan)])  # vertical velocity [m/s], paws down
 def test_jump_command_refuses_values_that_are_not_finite(values):
     command = JumpCommand()
     command.request()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import Z
 from jumper_warp.diff.closed_loop import ClosedLoop, heading_of
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.finetuning import make_groups
@@ -20,7 +21,8 @@ G = 9.81  # [m/s^2]
 
 
 @cache
-def policy(name="vertical_jump"):  # a shipped policy, opened once
+def policy(name="vertical_jump"):
+    """Return a shipped policy, opened once."""
     return open_policy(name)
 
 
@@ -71,7 +73,7 @@ def test_goal_offset_has_derivatives_by_the_bases_position():
     observed = env.obs.clone()
     observed[:, :2] = torch.tensor([0.7, -0.2])  # [m]
 
-    def offset(x, y):
+    def offset(x, y):  # observed offset of the goal [m], (2,) summed over worlds, from base positions (worlds,)
         q = torch.cat([x[None], y[None], state.q[2:]])
         return loop.observe(state._replace(q=q), observed)[:, :2].sum(0)
 
@@ -90,10 +92,11 @@ def apexes(loop, network, state, observed, weights, steps=30, tape=None):
     for _ in range(steps):
         state = loop.advance(state, network.act(loop.observe(state, observed), weights, tape))
     motion = loop.motion(state)
-    return motion.pos[:, 2] + motion.lin_vel[:, 2].square() / (2.0 * G)
+    return motion.pos[:, Z] + motion.lin_vel[:, Z].square() / (2.0 * G)
 
 
 def test_apex_gradients_by_weights_match_central_differences():
+    """Gradients by a policy's weights, of each world and of their sum, along three random directions."""
     group = jumps()
     group.begin()
     loop = ClosedLoop(group.env, double=True)

@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 
+from columns import Z
 from jumper_warp.diff.rollout import Rollout, compact
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.robot.model import build_model
@@ -87,13 +88,15 @@ def test_trajectory_stores_below_two_kilobytes_per_policy_step():
         assert per_row <= 2000.0  # [byte]
 
 
-def tensors():  # q (19,) and qd (18,) of `squat`
+def tensors():
+    """Return q (19,) and qd (18,) of `squat` as tensors."""
     q, qd = squat()
     return torch.tensor(q), torch.tensor(qd)
 
 
-def losses(trajectory):  # sum of squared torques and vertical impulses over steps, motors, paws and worlds
-    return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., 2].sum()
+def losses(trajectory):
+    """Return a weighted sum of squared torques and vertical impulses over steps, motors, paws and worlds."""
+    return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., Z].sum()
 
 
 def test_torch_gradients_match_central_differences():
@@ -102,7 +105,7 @@ def test_torch_gradients_match_central_differences():
     kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
     lengths = torch.tensor(of.geometry()).requires_grad_()
 
-    def loss(targets, kp, lengths):
+    def loss(targets, kp, lengths):  # `losses` plus the base's final height
         trajectory = simulate(of, targets, q, qd, kp=kp, geometry=lengths)
         return losses(trajectory) + trajectory.q[-1, 2].sum()
 
@@ -152,7 +155,7 @@ def test_gradient_by_q_includes_default_initial_target():
     targets, latency, results = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []  # [s]
 
     def height(q, **initial):  # [m] of the base at the end
-        return simulate(of, targets, q, qd, latency=latency, **initial).q[-1, 2].sum()
+        return simulate(of, targets, q, qd, latency=latency, **initial).q[-1, Z].sum()
 
     for explicit in (False, True):
         start = q.clone().requires_grad_()
@@ -160,7 +163,7 @@ def test_gradient_by_q_includes_default_initial_target():
         results.append(start.grad)
     runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), initial_target=start) for start in (None, q[7:].numpy())]
     cotangent = np.zeros(runs[0].q.shape)
-    cotangent[-1, 2] = 1.0
+    cotangent[-1, Z] = 1.0
     by_default, by_q_alone = (of.backward(made, q=of.array(cotangent))["q"].numpy() for made in runs)
     results.append(by_default)
     for entry in (8, 9):  # FL_outer, FL_inner

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from columns import X
 from jumper_warp.diff.bodies import body_gradients, moment_rows
 from jumper_warp.diff.rollout import GEOMETRY_NAMES, Rollout
 from jumper_warp.kernels.layout import (
@@ -52,16 +53,16 @@ def jump(**changes) -> dict[str, np.ndarray]:
     """Return the inputs of a jump with a latency of 6.1 ms, a wrench, and fading motors."""
     values = defaults()
     values["latency"] = np.array(0.0061)
-    values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
-    values["fade"] = np.array([4.0, 60.0])
+    values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]  # [N], [N m] in policy steps 5 to 14
+    values["fade"] = np.array([4.0, 60.0])  # [rad/s] speeds at which torque begins and ends to fade
     return values | changes
 
 
 def sliding() -> dict[str, np.ndarray]:
     """Return the inputs of a jump from a forward speed on slippery ground."""
     values = jump()
-    values["table"][MU_ROWS] = [0.25, 0.3] * 4
-    values["qd"][0] = 1.5
+    values["table"][MU_ROWS] = [0.25, 0.3] * 4  # dynamic and static friction by leg
+    values["qd"][X] = 1.5  # [m/s]
     return values
 
 
@@ -69,7 +70,8 @@ def folding() -> dict[str, np.ndarray]:
     """Return the inputs of a jump whose targets press the legs against narrow stops."""
     values = jump()
     for leg in range(4):
-        values["table"][leg * LEG + int(LOWER) : leg * LEG + int(LOWER) + 3] = [-0.6, 0.25, 0.3]
+        first = leg * LEG + int(LOWER)
+        values["table"][first : first + 3] = [-0.6, 0.25, 0.3]  # [rad] lateral, outer, inner
     return values
 
 
@@ -77,7 +79,8 @@ def sprung() -> dict[str, np.ndarray]:
     """Return the inputs of a jump with four different springs between the knees."""
     values = jump()
     for leg in range(4):
-        values["table"][leg * LEG + int(SPRING) : leg * LEG + int(SPRING) + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]
+        stiffness = leg * LEG + int(SPRING)
+        values["table"][stiffness : stiffness + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]  # [N/m], length [m]
     return values
 
 
@@ -108,6 +111,7 @@ CASES = {  # inputs, name of the input, its entries, step of the differences in 
 
 @pytest.mark.parametrize("case", CASES)
 def test_gradient_matches_differences(case):
+    """The gradient of the weighted sum by entries of one input equals differences of the sum."""
     make, name, entries, h = CASES[case]
     values = make()
     weights_by, gradient_by = gradients(rollout(), values)

@@ -68,7 +68,7 @@ def parsed(call, after="tyro.cli"):
     module, _, name = after.rpartition(".")
     original, errors = getattr(importlib.import_module(module), name), io.StringIO()
 
-    def stop(*args, **settings):
+    def stop(*args, **settings):  # parse the arguments, and raise instead of running the command
         raise Parsed(original(*args, **settings))
 
     with patch(after, stop), contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):

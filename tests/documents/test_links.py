@@ -19,6 +19,7 @@ class HtmlLinks(HTMLParser):
         self.links = []
 
     def handle_starttag(self, tag, attrs):
+        """Store the links of a start tag; attrs: pairs of name and value."""
         self.links += [value for name, value in attrs if name in ("src", "href")]
 
 

@@ -19,7 +19,7 @@ PAGES = [
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if not page.startswith(APART)])
-def test_page(page, tmp_path, one_thread):
+def test_snippets_of_a_page_run_or_parse(page, tmp_path, one_thread):
     Page(ROOT / page).run(tmp_path)
 
 

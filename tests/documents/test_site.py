@@ -23,11 +23,13 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def types_and_terms():
+    """Return the text of the generated pages of types and terms by file name."""
     return mdp_page.mdp_pages()
 
 
 @pytest.fixture(scope="module")
 def command_line():
+    """Return the text of the generated page of the command line."""
     return cli_page.cli_page()
 
 

@@ -28,7 +28,7 @@ register_task("my-jump", my_jump)
 def run(tmp_path):
     """Function that runs a page of the given text, whose first line is line 1, in the folder `tmp_path / "folder"`."""
 
-    def run(text):
+    def run(text):  # Markdown
         (tmp_path / "folder").mkdir()
         (tmp_path / "page.md").write_text(text)
         Page(tmp_path / "page.md").run(tmp_path / "folder")

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.filterwarnings("error::UserWarning:gymnasium")
 
 
 def jumper(num_envs=N, task=SHORT, **arguments) -> Env:
+    """Return an environment of short episodes on the CPU; arguments: of `Env`."""
     return Env(task, num_envs, device="cpu", **arguments)
 
 
@@ -40,9 +41,10 @@ def played(envs, actions=ACTIONS):
 
 
 def assert_same(first, second):
-    for a, b in zip(first, second, strict=True):
-        for x, y in zip(a[:4], b[:4], strict=True):
-            np.testing.assert_array_equal(x, y)
+    """Assert that two lists of (observation, reward, terminated, truncated, info) are equal but for info."""
+    for step, other in zip(first, second, strict=True):
+        for value, expected in zip(step[:4], other[:4], strict=True):
+            np.testing.assert_array_equal(value, expected)
 
 
 # ---------------------------------------------------------------- Gymnasium: spaces and data

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import MOTOR_COORDS, MOTOR_DOFS, Z
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, axis_turns, turn_metrics
 from jumper_warp.evaluation.log import run_evaluation
@@ -18,7 +19,6 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
-from solver_helpers import MOTOR_Q, MOTOR_V
 from support.momentum import momentum, rotational_inertia
 
 N = 64
@@ -49,10 +49,10 @@ def test_episodes_begin_at_rest_in_the_air_in_any_attitude_with_a_goal_of_the_le
     assert angle.min() > 20.0 - 1e-3 and angle.max() < 90.0 + 1e-3 and angle.std() > 10.0
     np.testing.assert_allclose(arrays["error"], angle * DEG, atol=1e-5)
     up = Rotation.from_quat(arrays["base_quat"]).apply([0.0, 0.0, 1.0])
-    assert up[:, 2].min() < -0.8 and up[:, 2].max() > 0.8 and np.abs(up.mean(axis=0)).max() < 0.3
+    assert up[:, Z].min() < -0.8 and up[:, Z].max() > 0.8 and np.abs(up.mean(axis=0)).max() < 0.3
     assert (arrays["base_pos"] == [0.0, 0.0, 2.0]).all() and not env.sim.joint_qd().any()
-    legs = q[:, MOTOR_Q].reshape(N, 4, 3)
-    default = (np.abs(q[:, MOTOR_Q] - env.robot.default_angle.numpy()) < 1e-6).all(axis=1)
+    legs = q[:, MOTOR_COORDS].reshape(N, 4, 3)
+    default = (np.abs(q[:, MOTOR_COORDS] - env.robot.default_angle.numpy()) < 1e-6).all(axis=1)
     assert 0.1 < default.mean() < 0.6
     assert (legs[~default, :, 0] >= -20.0 * DEG).all() and (legs[~default, :, 0] <= 80.0 * DEG).all()
     assert legs[~default, :, 1:].min() >= 0.0 and legs[~default].std(axis=0).min() > 0.2
@@ -81,7 +81,7 @@ def test_an_episode_succeeds_within_tolerance_and_without_collision(env):
     records["collisions"][2] = 1
     env.metrics()
     env.skills[0].states.assign(wp.array(records, dtype=AttitudeState, device="cpu"))
-    hold = (env.sim.joint_q()[:, MOTOR_Q] - env.robot.default_angle.numpy()) / (90.0 * DEG)
+    hold = (env.sim.joint_q()[:, MOTOR_COORDS] - env.robot.default_angle.numpy()) / (90.0 * DEG)
     action = torch.tensor(hold, dtype=torch.float32)
     for _ in range(30):
         step = env.step(action)
@@ -107,8 +107,8 @@ def test_momentum_and_inertia_agree_with_pinocchio(env):
         turn = Rotation.from_quat(q[3:7])
         spin = turn.inv().apply(qd[3:6])
         twist = np.concatenate([turn.inv().apply(qd[:3]) - np.cross(spin, com), spin])
-        full = robot.configuration(q[:3], q[3:7] / np.linalg.norm(q[3:7]), q[MOTOR_Q])
-        v = robot.closed_velocity(full, twist, qd[MOTOR_V])
+        full = robot.configuration(q[:3], q[3:7] / np.linalg.norm(q[3:7]), q[MOTOR_COORDS])
+        v = robot.closed_velocity(full, twist, qd[MOTOR_DOFS])
         expected = pin.computeCentroidalMomentum(robot.model, robot.data, full, v).vector
         assert np.abs(qd).max() > 1.0
         np.testing.assert_allclose(np.concatenate([linear[i], angular[i]]), expected, atol=1e-4)
@@ -140,12 +140,12 @@ def test_leg_motions_turn_the_robot_without_angular_momentum(env):
 def test_turn_metrics_have_error_settling_time_and_success(env):
     turns = AttitudeLog(axis_turns(N, 90.0), seconds=0.2)
     run_evaluation(lambda obs: torch.zeros(N, 12), env, turns)
-    np.testing.assert_allclose(env.task_arrays()["base_pos"][:, 2], 2.35, atol=0.05)
+    np.testing.assert_allclose(env.task_arrays()["base_pos"][:, Z], 2.35, atol=0.05)
     np.testing.assert_allclose(np.degrees(turns.error), 90.0, atol=5.0)
     axis = Rotation.from_quat(turns.turns[:6]).as_rotvec() / DEG
     np.testing.assert_allclose(axis, 90.0 * np.repeat(np.eye(3), 2, axis=0) * np.tile([[1], [-1]], (3, 1)), atol=1e-9)
 
-    def success():
+    def success():  # share of turns that settled without collision
         return turn_metrics(turns)["settled_without_collision_rate"].value
 
     assert success() == 0.0 and axis_metrics(turns)["roll_plus_settling_time_mean_s"].value is None

@@ -23,6 +23,7 @@ def launched(monkeypatch):
 
 
 def compiled(env, **options):
+    """Return the names of the modules of an environment's kernels; options: of `Env.kernels`."""
     return {kernel.module.name for kernel, _ in env.kernels(**options)}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import X, Z
 from jump_helpers import edit_coordinates, edit_episodes, make_env, only, resets_of, resetting
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.jump.state import LANDED, STANCE
@@ -30,6 +31,7 @@ def ground_task(**shares) -> TaskCfg:
 
 
 def blocks_of(env: Env) -> np.ndarray:
+    """Return the blocks on the ground of all worlds, a structured array."""
     return env.sim.physics.dynamics.robot.ground.blocks.numpy()
 
 
@@ -74,7 +76,7 @@ def test_an_evaluation_levels_the_ground_and_a_reset_samples_it_again():
     assert blocks_of(env)["exists"].any()
     env.evaluation_reset(np.tile([1.5, 0.0, 0.0], (N, 1)))
     assert not blocks_of(env)["exists"].any() and not env.task_arrays()["goal_ground"].any()
-    np.testing.assert_allclose(env.sim.joint_q()[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-6)
+    np.testing.assert_allclose(env.sim.joint_q()[:, Z], env.sim.model.joint_q.numpy()[2], atol=1e-6)
     env.step(REST)
     assert not blocks_of(env)["exists"].any()
     env.reset()
@@ -92,7 +94,7 @@ def test_an_evaluation_starts_robots_on_the_block_below_them():
     goals[::2, 0] = 0.65
     env.evaluation_reset(goals)
     episodes, height = env.task_arrays(), env.sim.model.joint_q.numpy()[2] + tops
-    for found in (env.sim.joint_q()[:, 2], episodes["start"][:, 2], episodes["max_height"]):
+    for found in (env.sim.joint_q()[:, Z], episodes["start"][:, Z], episodes["max_height"]):
         np.testing.assert_allclose(found, height, atol=1e-6)
     # the block ends at x = 0.6 m
     np.testing.assert_allclose(episodes["goal_ground"], np.where(np.arange(N) % 2, tops, 0.0), atol=1e-6)
@@ -101,13 +103,13 @@ def test_an_evaluation_starts_robots_on_the_block_below_them():
         env.step(REST)
         assert not env.done.any() and not env.robot.diverged.numpy().any()
     env.sim.physics.write_bodies()
-    np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
+    np.testing.assert_allclose(paw_centres(env.sim)[..., Z], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 
 
 def test_an_evaluation_starts_robots_on_the_floor_outside_a_block():
     env = make_env(2, task=make_task("horizontal-jump"), block=HALF_SPACE)
     env.evaluation_reset([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
-    np.testing.assert_allclose(env.sim.joint_q()[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-6)
+    np.testing.assert_allclose(env.sim.joint_q()[:, Z], env.sim.model.joint_q.numpy()[2], atol=1e-6)
     np.testing.assert_allclose(env.task_arrays()["goal_ground"], [0.0, 0.06], atol=1e-6)
 
 
@@ -129,7 +131,7 @@ def landed():
 
 def on_block(goal: np.ndarray) -> np.ndarray:
     """Return the height [m] of the ground at goals (n, 3)."""
-    return np.where(goal[:, 0] > 0.5, 0.06, 0.0)
+    return np.where(goal[:, X] > 0.5, 0.06, 0.0)
 
 
 def test_the_next_jump_of_an_evaluation_has_the_ground_height_at_its_goal(landed):
@@ -153,7 +155,7 @@ def test_the_next_jump_of_an_episode_has_the_ground_height_at_its_goal(landed):
 
 def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(landed):
     moved = blocks_of(landed)
-    moved["center"][:, 0] += 20.0
+    moved["center"][:, X] += 20.0
     landed.sim.physics.dynamics.robot.ground.blocks.assign(moved)
     landed.command(np.tile([0.75, 0.3, 0.0], (N, 1)))
     assert not landed.task_arrays()["goal_ground"].any()

@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 
+from columns import MOTOR_COORDS, Z
 from jump_helpers import (
     edit_coordinates,
     edit_episodes,
@@ -199,8 +200,9 @@ def test_final_obs_is_the_last_observation_and_obs_the_first_of_the_next_episode
     assert torch.equal(one.final_obs, other.final_obs)  # those of an equal environment without auto_reset
     assert torch.equal(one.obs[~ended], one.final_obs[~ended])
     assert (one.obs[ended] != one.final_obs[ended]).any(dim=1).all()
-    height = one.sim.joint_q()[:, 2]
-    assert np.abs(one.obs[:, 2].numpy() - height).max() <= 0.005 + 1e-6
+    height = one.sim.joint_q()[:, Z]
+    observed_height = one.obs[:, 2].numpy()
+    assert np.abs(observed_height - height).max() <= 0.005 + 1e-6  # [m], the bound of its noise
 
 
 def test_a_reset_clears_histories_and_counters():
@@ -217,7 +219,7 @@ def test_a_reset_clears_histories_and_counters():
                  "impulse", "contact_time", "air_time", "touchdown_speed", "peak_force", "prev_lin_vel"):  # fmt: skip
         assert not getattr(robot, name).numpy().any(), name
     assert not env.obs[:, -12:].any() and env.final_obs[:, -12:].any()
-    angles = env.sim.joint_q()[:, 7:27].reshape(N, 4, 5)[:, :, [0, 1, 3]].reshape(N, 12)
+    angles = env.sim.joint_q()[:, MOTOR_COORDS]
     np.testing.assert_array_equal(robot.filtered_target.numpy().T, angles)
     np.testing.assert_array_equal(env.delays.target_history.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
 
@@ -232,19 +234,20 @@ def test_an_evaluation_may_delay_commands_by_world(env):
 
 def test_an_evaluation_starts_all_worlds_in_the_default_pose(env):
     goals = np.zeros((N, 3))
-    goals[:, 2] = np.linspace(0.5, 1.2, N)
-    env.evaluation_reset(jump_commands(goals, 0.25, env.step_dt))
+    goals[:, Z] = np.linspace(0.5, 1.2, N)  # [m]
+    env.evaluation_reset(jump_commands(goals, 0.25, env.step_dt))  # commanded after 0.25 s, in policy step 15
     arrays = env.task_arrays()
     np.testing.assert_allclose(arrays["goal"], goals, atol=1e-6)
     assert (arrays["command_step"] == 15).all() and not arrays["steps"].any()
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(N, -1))
-    np.testing.assert_allclose(env.obs[:, 0], goals[:, 2], atol=1e-6)
+    np.testing.assert_allclose(env.obs[:, 0], goals[:, Z], atol=1e-6)  # the first observation is the commanded height
 
 
 # ---------------------------------------------------------------- reproducibility and solvers
 
 
 def run(env, actions):
+    """Return observations, final observations, rewards and ends of all steps, a list of four tensors a step."""
     trace = []
     for action in actions:
         env.step(action)

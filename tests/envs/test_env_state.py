@@ -46,6 +46,7 @@ def train_jump(cfg):
 
 @pytest.fixture
 def cfg(tmp_path):
+    """Return the settings of a training of four iterations with two checkpoints."""
     return TrainCfg(
         task="jump", num_envs=N, max_iterations=4, device="cpu", log_root=tmp_path, log_interval=4, save_interval=2,
         tensorboard=False, ppo=PPO,

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from columns import Z
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
@@ -28,7 +29,7 @@ def flown():
         action = torch.tensor(flights.action(90.0, None), dtype=torch.float32)
         env.step(torch.stack([action, torch.zeros(N, 12)]))
         turn, jump = (env.skills[skill].states.numpy().copy() for skill in (TURN, JUMP))
-        height, rise = env.sim.joint_q()[:, 2].copy(), env.sim.joint_qd()[:, 2].copy()
+        height, rise = env.sim.joint_q()[:, Z].copy(), env.sim.joint_qd()[:, Z].copy()
         seen.append((env.episodes.skill.numpy().copy(), turn, jump, height, rise))
         if flights.record_step(env):
             break
@@ -55,7 +56,7 @@ def test_the_goal_is_level_in_the_jumps_heading_and_the_jump_continues_after_it(
     turning = next(turn for skill, turn, *_ in seen if (skill == TURN).all())
     euler = Rotation.from_quat(turning["goal"]).as_euler("ZYX")
     np.testing.assert_allclose(euler, 0.0, atol=1e-6)
-    np.testing.assert_allclose(turning["jump_goal"][:, 2], 2.5)
+    np.testing.assert_allclose(turning["jump_goal"][:, Z], 2.5)
     landing = next(jump for i, (skill, _, jump, *_) in enumerate(seen) if i > 100 and (skill == JUMP).all())
     np.testing.assert_allclose(landing["goal"], turning["jump_goal"])
     assert (landing["phase"] >= 1).all() and (landing["max_height"] > 2.0).all()

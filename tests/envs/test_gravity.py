@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tyro
 
+from columns import XY, Z
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts
 from jumper_warp.cli.train import parse_train
@@ -29,8 +30,8 @@ def test_a_thrown_robot_follows_the_parabola_of_its_gravity(solver):
     sim.physics.write_bodies()
     mass = sim.model.body_mass.numpy()
 
-    def com() -> float:
-        return float((mass * sim.state.body_q.numpy()[:, 2]).sum() / mass.sum())
+    def com() -> float:  # height [m] of the robot's centre of mass
+        return float((mass * sim.state.body_q.numpy()[:, Z]).sum() / mass.sum())
 
     before = com()
     for _ in range(15):  # 0.25 s
@@ -54,8 +55,8 @@ def test_starts_in_flight_reach_their_apex_in_each_worlds_own_gravity():
     env.sim.model.gravity.assign(np.pad(np.outer(own, [0.0, 0.0, -1.0]), ((0, 1), (0, 0))).astype(np.float32))
     env.sim.physics.parameters_changed()
     env.reset()
-    q, qd, goals = env.sim.joint_q(), env.sim.joint_qd(), episodes_of(env)["goal"][:, 2]
-    np.testing.assert_allclose(q[:, 2] + qd[:, 2] ** 2 / (2.0 * own), goals, atol=1e-4)
+    q, qd, goals = env.sim.joint_q(), env.sim.joint_qd(), episodes_of(env)["goal"][:, Z]
+    np.testing.assert_allclose(q[:, Z] + qd[:, Z] ** 2 / (2.0 * own), goals, atol=1e-4)
     errors = env.task.layout("critic")["height_errors"][0]
     np.testing.assert_allclose(env.critic_obs[:, errors + 1].numpy(), 0.0, atol=1e-4)
 
@@ -63,12 +64,12 @@ def test_starts_in_flight_reach_their_apex_in_each_worlds_own_gravity():
 def test_starts_in_flight_come_down_at_their_goal_on_mars():
     env = make_env(64, task=HORIZONTAL)
     found = Starts(env, "in_flight", exact=True, takeoff_angle=(45.0, 45.0))
-    up = found.vel[:, 2]
-    time = (up + np.sqrt(up**2 + 2.0 * MARS * (found.pos[:, 2] - 0.30))) / MARS
-    place = found.pos[:, :2] + time[:, None] * found.vel[:, :2]
+    up = found.vel[:, Z]
+    time = (up + np.sqrt(up**2 + 2.0 * MARS * (found.pos[:, Z] - 0.30))) / MARS
+    place = found.pos[:, XY] + time[:, None] * found.vel[:, XY]
     far = found.distance > 0.1
     np.testing.assert_allclose(place[far], found.goal[far, :2], atol=2e-3)
-    slope = np.arctan2(found.vel[:, 2], np.linalg.norm(found.vel[:, :2], axis=1)) / DEG
+    slope = np.arctan2(found.vel[:, Z], np.linalg.norm(found.vel[:, XY], axis=1)) / DEG
     assert slope.max() < 45.0
 
 

@@ -8,6 +8,7 @@ import torch
 from gymnasium.wrappers.vector import RecordVideo
 from scipy.interpolate import RegularGridInterpolator
 
+from columns import XY
 from jumper_warp.envs.camera import WorldCamera
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
@@ -153,11 +154,11 @@ def test_drawn_heightfield_equals_the_simulated_one(point):
     vertices = mesh.vertices.astype(float) + [*point, 0.0]
     heights = field.min_z + field.data * (field.max_z - field.min_z)
     axes = np.linspace(-field.hy, field.hy, field.nrow), np.linspace(-field.hx, field.hx, field.ncol)
-    inside = np.abs(vertices[:, :2]).max(axis=1) < field.hx
+    inside = np.abs(vertices[:, XY]).max(axis=1) < field.hx
     expected = RegularGridInterpolator(axes, heights)(vertices[inside][:, 1::-1])
     np.testing.assert_allclose(vertices[inside, 2], expected, atol=1.0e-4)
     assert inside.sum() > 1000 and np.ptp(vertices[inside, 2]) > 0.05
-    assert np.isfinite(vertices).all() and np.abs(vertices[:, :2] - point).max() == pytest.approx(5.0, abs=0.1)
+    assert np.isfinite(vertices).all() and np.abs(vertices[:, XY] - point).max() == pytest.approx(5.0, abs=0.1)
 
 
 def test_ray_tracer_is_used_without_opengl(envs, monkeypatch, capsys):

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import hold_height
+from columns import Z
 from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
@@ -24,12 +25,14 @@ PPO = PpoCfg(num_steps=12, epochs=4, minibatches=4, hidden=(32,), lr=2e-3, desir
 
 
 def make_env(num_envs=N, task=None, **arguments) -> Env:
+    """Return a reset environment, by default of the task `hold_height`; arguments: of `Env`."""
     env = Env(task or hold_height.hold_height(), num_envs, **({"seed": 1, "device": "cpu"} | arguments))
     env.reset()
     return env
 
 
 def states_of(env) -> np.ndarray:
+    """Return a copy of the task states of all worlds, a structured array."""
     return env.skills[0].states.numpy().copy()
 
 
@@ -53,7 +56,7 @@ def mean_error(env, ppo) -> float:
             env.step(ppo.model.actor(ppo.model.features(env.obs)))
             states = env.skills[0].states.numpy()
             is_late = states["age"] >= 15
-            errors.append(np.abs(env.sim.joint_q()[:, 2] - states["goal"])[is_late])
+            errors.append(np.abs(env.sim.joint_q()[:, Z] - states["goal"])[is_late])
     return float(np.concatenate(errors).mean())
 
 
@@ -105,7 +108,7 @@ def test_user_defined_state_settings_and_levels_are_used():
 
 def test_a_command_reaches_reward_and_observation():
     env = make_env(randomize=False, noise=False)
-    height = env.sim.joint_q()[:, 2].copy()
+    height = env.sim.joint_q()[:, Z].copy()
     goals = np.linspace(0.25, 0.4, N)[:, None].astype(np.float32)
     chosen = np.arange(N) % 2 == 0
     env.command(goals, chosen)
@@ -114,7 +117,7 @@ def test_a_command_reaches_reward_and_observation():
     np.testing.assert_allclose(env.obs[:, 0], 5.0 * goals[:, 0], rtol=1e-6)
     np.testing.assert_allclose(env.obs[:, 1:4], np.tile(5.0 * height[0], (N, 3)), rtol=1e-5)  # history: first frame
     env.step(torch.zeros((N, 12)))
-    height = env.sim.joint_q()[:, 2]
+    height = env.sim.joint_q()[:, Z]
     np.testing.assert_allclose(env.reward, np.exp(-np.abs(height - goals[:, 0]) / 0.05), rtol=1e-4)
     np.testing.assert_allclose(env.obs[:, 3], 5.0 * height, rtol=1e-5)
     assert (states_of(env)["goal"] == goals[:, 0]).all() and (env.obs[:, 1:3] == env.obs[0, 1]).all()

@@ -6,22 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from columns import MOTOR_DOFS
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.randomization import RandomizationCfg
-from randomization_helpers import (
-    ALL,
-    BEYOND,
-    HELD,
-    MOTOR_DOFS,
-    OFF,
-    PAPER,
-    ROWS,
-    WALKING,
-    fills,
-    own_model,
-    randomized,
-    read,
-)
+from randomization_helpers import ALL, BEYOND, HELD, OFF, PAPER, ROWS, WALKING, fills, own_model, randomized, read
 
 
 @pytest.fixture(scope="module")

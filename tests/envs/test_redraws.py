@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import Z
 from jump_helpers import DEG, edit_episodes, make_env, only, random_actions, resetting
 from jumper_warp.evaluation.jumps import paw_arrays
 from jumper_warp.kernels.jump.state import LANDED
@@ -126,7 +127,7 @@ def test_a_push_increases_momentum_by_force_times_time():
     push[1, :3] = [4.0, -3.0, 5.0]
     env.parameters.push.assign(push.astype(np.float32))
     q = env.sim.joint_q().copy()
-    q[:, 2] += 0.5
+    q[:, Z] += 0.5
     env.sim.state.joint_q.assign(q.ravel())
     env.robot.contact_time.fill_(1.0)
     env.step(torch.zeros((2, 12)))

@@ -8,6 +8,7 @@ import torch
 import warp as wp
 
 import hold_height
+from columns import Z
 from hold_height import HoldState
 from jump_helpers import random_actions
 from jumper_warp.envs.env import Env
@@ -28,11 +29,13 @@ SKILL = np.arange(N) % 3 == 1
 
 @wp.func
 def always(robot: RobotView, state: HoldState, requested: bool) -> bool:
+    """Begin the next skill at once, whether requested or not."""
     return True
 
 
 @wp.func
 def keep_holding(robot: RobotView, state: HoldState) -> HoldState:
+    """Return the state of the next skill: the same."""
     return state
 
 
@@ -41,6 +44,7 @@ TO_HOLD = Handover(JUMP, HOLD, hold_requested, begin_hold)
 
 
 def make(*tasks, **arguments) -> Env:
+    """Return a reset environment of N worlds with a skill for each task; arguments: of `Env`."""
     env = Env(tasks if len(tasks) > 1 else tasks[0], N, **({"seed": 5, "device": "cpu"} | arguments))
     env.reset()
     return env
@@ -57,6 +61,7 @@ def parameters_of(env) -> dict[str, np.ndarray]:
 
 
 def coordinates(env) -> np.ndarray:
+    """Return joint_q and joint_qd of each world side by side, (N, 81)."""
     return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
 
 
@@ -268,7 +273,7 @@ def test_a_command_in_the_request_is_given_at_the_handover():
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False, noise=False)
     followed(env, torch.zeros((3, N, 12)))
     commands = np.zeros((N, 3))
-    commands[:, 2] = np.linspace(0.6, 0.9, N)
+    commands[:, Z] = np.linspace(0.6, 0.9, N)
     env.request(0, CHOSEN, commands)
     env.request(0, np.arange(N) == 7)
     followed(env, torch.zeros((1, N, 12)))

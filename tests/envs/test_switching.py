@@ -27,6 +27,7 @@ HANDOVERS = "jumper_warp.kernels.skills.handovers"
 
 
 def coordinates(env) -> np.ndarray:
+    """Return joint_q and joint_qd of each world side by side, (worlds, 81)."""
     return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
 
 

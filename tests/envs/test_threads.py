@@ -39,11 +39,13 @@ HOLD = hold_height.hold_height()
 
 @wp.func
 def in_the_air(robot: RobotView, state: JumpState, requested: bool) -> bool:
+    """Return whether no paw touches the ground."""
     return robot.contacts == 0
 
 
 @pytest.fixture(autouse=True)
 def all_cores():
+    """Give the threads of all cores back after a test."""
     yield
     pool.set_threads(None)
 
@@ -75,6 +77,7 @@ def assert_same(found, expected):
 
 @pytest.fixture(scope="module")
 def alone():
+    """Return the results of `run` on one thread."""
     return run(1)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import QUAT, XY, X, Y, Z
 from ground_helpers import heights
 from jump_helpers import edit_coordinates, ending_names, random_actions
 from jumper_warp.kernels.collision.robot import SHANK_GROUND
@@ -21,6 +22,7 @@ MAP = TerrainCfg(rows=2, tile=4.0, cell=0.1, start=0.6, border=1.0)
 
 
 def on_small_map() -> TaskCfg:
+    """Return velocity-rough on the terrain `MAP`."""
     rough = make_task("velocity-rough")
     settings = dataclasses.replace(rough.reset.settings, terrain=MAP)
     return dataclasses.replace(rough, reset=dataclasses.replace(rough.reset, settings=settings))
@@ -34,6 +36,7 @@ def rough():
 
 @pytest.fixture(scope="module")
 def flat():
+    """Return a walking environment of 8 worlds on flat ground."""
     return walking_env(8)
 
 
@@ -54,11 +57,11 @@ def test_robots_begin_on_tiles_of_their_level(rough):
         edit(rough, terrain_level=level, steps=0)
         rough.reset()
         q = rough.sim.joint_q()
-        rows, cols = np.floor(q[:, 0] / 4.0 + 1.0), np.floor(q[:, 1] / 4.0 + 4.0)
+        rows, cols = np.floor(q[:, X] / 4.0 + 1.0), np.floor(q[:, Y] / 4.0 + 4.0)
         assert set(rows) == ({level} if level < 2 else {0, 1})
         assert len(set(cols)) >= 7 and set(states_of(rough)["terrain_level"]) == {level}
-        assert np.abs(np.mod(q[:, :2], 4.0) - 2.0).max() <= 0.1 + 1e-5
-        above = q[:, 2] - height_at(q[:, 0], q[:, 1])
+        assert np.abs(np.mod(q[:, XY], 4.0) - 2.0).max() <= 0.1 + 1e-5
+        above = q[:, Z] - height_at(q[:, X], q[:, Y])
         assert above.min() > 0.29 and above.max() < 0.51
     np.testing.assert_array_equal(states_of(rough)["limit"], np.tile([4.0, 16.0], (N, 1)))
 
@@ -68,21 +71,21 @@ def test_paw_heights_and_ground_heights_around_the_base_are_those_of_the_map(rou
     for action in random_actions(N, 8):
         rough.step(0.2 * action)
     paws = rough.robot.paw_pos.numpy()
-    wanted = paws[..., 2] - height_at(paws[..., 0], paws[..., 1]) - 0.025
+    wanted = paws[..., Z] - height_at(paws[..., X], paws[..., Y]) - 0.025
     is_running = rough.done.numpy() == 0.0
     assert is_running.sum() > N // 2
     np.testing.assert_allclose(rough.robot.paw_height.numpy()[:, is_running], wanted[:, is_running], atol=1e-4)
 
     q = rough.sim.joint_q().astype(float)
-    x, y, z, w = q[:, 3:7].T
+    x, y, z, w = q[:, QUAT].T
     heading = np.arctan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z))
     first, end = rough.skills[0].task.layout("critic")["ground_heights"]
     grid = [(0.25 * (i // 3 - 2), 0.2 * (i % 3 - 1)) for i in range(15)]
     for column, (ahead, left) in zip(range(first, end), grid, strict=True):
-        px = q[:, 0] + ahead * np.cos(heading) - left * np.sin(heading)
-        py = q[:, 1] + ahead * np.sin(heading) + left * np.cos(heading)
+        px = q[:, X] + ahead * np.cos(heading) - left * np.sin(heading)
+        py = q[:, Y] + ahead * np.sin(heading) + left * np.cos(heading)
         seen = rough.critic_obs[:, column].numpy()
-        np.testing.assert_allclose(seen, q[:, 2] - height_at(px, py) - 0.35, atol=2e-4)
+        np.testing.assert_allclose(seen, q[:, Z] - height_at(px, py) - 0.35, atol=2e-4)
     assert np.ptp(rough.critic_obs[:, first:end].numpy(), axis=1).max() > 0.05
 
 
@@ -111,7 +114,7 @@ def test_leaving_the_map_ends_the_episode_as_a_time_out(rough):
 def test_nominal_environment_is_on_a_plane():
     env = walking_env(4, task=on_small_map())
     assert env.sim.physics.dynamics.robot.ground.rows == 0
-    assert np.abs(env.sim.joint_q()[:, :2]).max() <= 0.1 and not states_of(env)["limit"].any()
+    assert np.abs(env.sim.joint_q()[:, XY]).max() <= 0.1 and not states_of(env)["limit"].any()
 
 
 def test_metrics_are_ratios_of_sums_over_worlds(flat):

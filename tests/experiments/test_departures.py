@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from columns import Z
 from experiments import departures
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.jumps import TERMINATIONS, jump_commands
@@ -87,7 +88,7 @@ def test_paws_penetrate_the_ground_by_less_than_a_millimetre(randomize):
     policy = load_policy("vertical_jump")
     env = env_of_policy(policy, 20, Conditions(randomize=randomize, noise=randomize, device="cpu"))
     goals = np.zeros((20, 3))
-    goals[:, 2] = np.linspace(0.5, 1.05, 20)
+    goals[:, Z] = np.linspace(0.5, 1.05, 20)
     env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt))
     lowest = np.full(20, np.inf)  # [m] lowest point of a paw above the ground
     for _ in range(180):

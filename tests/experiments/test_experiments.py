@@ -137,7 +137,8 @@ class OpenLoopPolicy:
 
 
 @pytest.fixture(scope="module")
-def sweep_env():  # environment of three nominal robots with the terminations of the sweep
+def sweep_env():
+    """Return an environment of three nominal robots with the terminations of the sweep."""
     return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_jump_terminations)
 
 
@@ -268,7 +269,7 @@ def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates
     )
 
     @dataclass
-    class Args:
+    class Args:  # flags of the script
         envs: tuple
         noise: bool
         baseline: Path

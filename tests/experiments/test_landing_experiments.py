@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import X, Y
 from experiments import paper_tests
 from jumper_warp.evaluation.jumps import TERMINATIONS
 from jumper_warp.evaluation.landings import LandingLog
@@ -205,9 +206,9 @@ def test_platform_scenes_have_specified_ground_block_and_headings():
     assert x[heights[0] > 0.5].max() == pytest.approx(0.46) and (heights == heights[0]).all()
     assert len(set(scenes["uneven"][1])) == 2
     block, headings = scenes["block"][0]["block"], scenes["block"][1]
-    near, far = (block.center[:, 0] + side * block.half[:, 0] for side in (-1.0, 1.0))
-    assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, 0] + 0.40)
-    assert block.center[:, 1] == pytest.approx(goals[:, 1]) and not headings.any()
+    near, far = (block.center[:, X] + side * block.half[:, 0] for side in (-1.0, 1.0))
+    assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, X] + 0.40)
+    assert block.center[:, Y] == pytest.approx(goals[:, Y]) and not headings.any()
     assert [name for name, *_ in Platform(solver="mujoco").scenes(goals, rng)] == ["platform", "uneven"]
 
 

@@ -35,10 +35,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_payload_keeps_springs_and_moves_the_mass_towards_the_centre_of_the_base():
-    robot = payload_overlay(with_springs(600.0, 0.2), 3.0).robots()
-    np.testing.assert_allclose(robot.base_mass, [[9.43]])
-    np.testing.assert_allclose(robot.base_com, [[-0.0094 * 6.43 / 9.43, 0.0, 0.0111 * 6.43 / 9.43]])
-    np.testing.assert_allclose(robot.base_mass / 6.43 * robot.base_inertia, 1.0)  # what the model scales inertia by
+    base, payload = 6.43, 3.0  # [kg]; the payload is at the base's origin
+    robot = payload_overlay(with_springs(600.0, 0.2), payload).robots()
+    share = base / (base + payload)
+    np.testing.assert_allclose(robot.base_mass, [[base + payload]])
+    np.testing.assert_allclose(robot.base_com, [[-0.0094 * share, 0.0, 0.0111 * share]])  # [m]
+    np.testing.assert_allclose(robot.base_mass / base * robot.base_inertia, 1.0)  # what the model scales inertia by
     assert robot.spring_stiffness[0, 0] == 600.0
 
 

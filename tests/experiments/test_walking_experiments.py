@@ -56,13 +56,13 @@ def test_kicked_and_sped_up_walks_have_specified_kicks_and_speeds():
         num_envs, task, step_dt = 16, make_task("velocity-flat"), 1.0 / 60.0
 
     kicked = kicked_walks(Env, np.random.default_rng(0))
-    np.testing.assert_allclose(np.linalg.norm(kicked.kick, axis=1), 0.5)
-    assert kicked.kick_time.min() >= 2.0 and kicked.kick_time.max() <= 4.0
-    fast, which = sped_up_walks(Env)
-    last = fast.commands[:, -1]
-    np.testing.assert_allclose(last[which == 1, 0], -np.linspace(0.3, 4.0, 4))
-    np.testing.assert_allclose(last[which == 2, 1], np.linspace(0.3, 2.0, 4))
-    assert not last[which == 3, :2].any() and fast.times[-1] < 3.0
+    np.testing.assert_allclose(np.linalg.norm(kicked.kick, axis=1), 0.5)  # [m/s]
+    assert kicked.kick_time.min() >= 2.0 and kicked.kick_time.max() <= 4.0  # [s]
+    fast, direction = sped_up_walks(Env)  # direction of each walk: 1 backward, 2 sideways, 3 turning
+    ahead, left, _ = fast.commands[:, -1].T  # the last, fastest command [m/s]
+    np.testing.assert_allclose(ahead[direction == 1], -np.linspace(0.3, 4.0, 4))
+    np.testing.assert_allclose(left[direction == 2], np.linspace(0.3, 2.0, 4))
+    assert not ahead[direction == 3].any() and not left[direction == 3].any() and fast.times[-1] < 3.0
 
 
 def test_refuses_policy_of_other_task_and_invalid_settings(policies, tmp_path):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import trimesh
 
+from columns import POS, X, Z
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.shapes import ShapeMesh
 
@@ -29,7 +30,7 @@ def box_recording(positions, *, forces=None, yaw=0.0, **fields):
     positions = positions[:, None] if positions.ndim == 2 else positions
     frames, worlds = positions.shape[:2]
     poses = np.zeros((frames, worlds, 7), np.float32)
-    poses[..., :3], poses[..., 5], poses[..., 6] = positions, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+    poses[..., POS], poses[..., 5], poses[..., 6] = positions, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
     paws = np.zeros((frames, worlds, 1, 3), np.float32)
     paws[..., 0, :] = positions - [0.0, 0.0, STANDING]
     contact = np.zeros_like(paws)
@@ -55,7 +56,7 @@ def walk(distance, seconds=0.5):
     """Return base positions [m], (frames, 3), of a robot that moves at constant velocity along x."""
     frames = round(seconds * RATE) + 1
     positions = np.zeros((frames, 3))
-    positions[:, 0], positions[:, 2] = np.linspace(0.0, distance, frames), STANDING
+    positions[:, X], positions[:, Z] = np.linspace(0.0, distance, frames), STANDING
     return positions
 
 

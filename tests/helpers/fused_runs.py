@@ -59,6 +59,7 @@ def interpreted(function, *args):
 
 
 def _interpret():
+    """Run Triton's kernels in its interpreter, on the CPU."""
     os.environ["TRITON_INTERPRET"] = "1"
     from jumper_warp.rl.fused import networks
 

@@ -18,6 +18,7 @@ def heights(field):
 
 @wp.kernel
 def surface_kernel(ground: Ground, x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array(dtype=wp.vec3)):
+    """Write what `surface` returns at positions x, y [m] to out; one thread per position."""
     i = wp.tid()
     out[i] = surface(ground, x[i], y[i])
 

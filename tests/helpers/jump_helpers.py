@@ -7,6 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from columns import MOTOR_COORDS, Z
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
@@ -19,7 +20,7 @@ from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability
 from jumper_warp.tasks.jump.observations import EPISODE
 from jumper_warp.tasks.observations import exact
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
+from mdp_helpers import DEFAULT_ANGLE, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
 START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
@@ -110,7 +111,7 @@ class Robots:
         self.skill, self.n = TaskRuntime(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
         self.numbers = {True: array(task.params.values), False: array(task.without_noise().params.values)}
         self.q, self.qd = np.zeros((n, 43)), np.zeros((n, 38))
-        self.q[:, 2], self.q[:, 6], self.q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
+        self.q[:, Z], self.q[:, 6], self.q[:, MOTOR_COORDS] = 0.35, 1.0, DEFAULT_ANGLE
         self.com, self.action, self.offset = np.zeros(3), np.zeros((12, n)), np.zeros((12, n))
         self.force, self.heights = np.zeros((4, n, 3)), np.zeros((1, 1))
         self.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5)] * n

@@ -7,6 +7,7 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import LIN_VEL, POS
 from jump_helpers import START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.collision.robot import collision_kernel
@@ -34,7 +35,7 @@ class Starts:
         self.episodes = {name: values[drawn].astype(float) for name, values in episodes.items()}
         self.q, self.qd = env.sim.joint_q()[drawn].astype(float), env.sim.joint_qd()[drawn].astype(float)
         self.level = self.level[drawn]
-        self.pos, self.vel = self.q[:, :3], self.qd[:, :3]
+        self.pos, self.vel = self.q[:, POS], self.qd[:, LIN_VEL]
         self.heading = Rotation.from_euler("z", self.episodes["heading"][:, None])
         self.goal = self.episodes["goal"] * [1.0, 1.0, 0.0]
         self.distance = np.linalg.norm(self.goal, axis=1)

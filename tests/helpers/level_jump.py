@@ -16,6 +16,7 @@ def level(robot: mdp.RobotView, state: Any, scale: float) -> float:
 
 
 def level_jump():
+    """Return vertical-jump with the reward `level` in addition."""
     task = make_task("vertical-jump")
     return replace(task, name="level-jump", rewards=(*task.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
+from columns import MOTOR_COORDS, Z
 from jumper_warp.envs.arrays import delay_arrays, episode_arrays
 from jumper_warp.kernels.layout import BODIES, COORDS, DOFS
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
@@ -13,7 +14,6 @@ from jumper_warp.kernels.mdp.view import RobotArrays
 STEP_DT = 1.0 / 60.0  # [s]
 SUBSTEPS = 8
 DEFAULT_ANGLE = np.tile([0.0, np.pi / 4.0, np.pi / 4.0], 4)  # [rad]
-MOTOR_SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAWS = ("impulse", "paw_force", "peak_force", "paw_pos", "paw_vel", "contact_time", "air_time", "touchdown_speed",
         "collisions", "paw_height")  # fmt: skip
 MOTORS = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target",
@@ -28,7 +28,7 @@ def array(values, dtype=float) -> wp.array:
 def standing_robots(n: int):
     """Return `RobotArrays` of n robots at rest in the default pose, 0.35 m high, with empty histories."""
     robot, q = RobotArrays(), np.zeros((n, int(COORDS)))
-    q[:, 2], q[:, 6], q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
+    q[:, Z], q[:, 6], q[:, MOTOR_COORDS] = 0.35, 1.0, DEFAULT_ANGLE
     robot.joint_q, robot.joint_qd = array(q.ravel()), array(np.zeros(n * int(DOFS)))
     robot.body_com = array(np.zeros((n * int(BODIES), 3)), wp.vec3)
     robot.body_f = array(np.zeros((n * int(BODIES), 6)), wp.spatial_vector)

@@ -19,7 +19,6 @@ OF_MODEL = (
     "base_mass", "base_moments", "link_mass", "link_moments", "com_shift", "armature", "motor_friction",
     "static_friction", "dynamic_friction",
 )  # fmt: skip
-MOTOR_DOFS = np.array([6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 PAPER = {
     "static_friction": (0.9, 1.2), "dynamic_friction": (0.8, 0.9), "base_mass": (-1.0, 2.0), "link_mass": (0.8, 1.2),
     "com_shift": (-0.03, 0.03), "gains": (0.6, 1.4), "no_load_speed": (0.8, 1.2), "cutoff_speed": (0.8, 1.4),
@@ -43,6 +42,7 @@ ALL = PAPER | {"observation_latency": (0.0, 16.0)}  # Every row
 
 
 def randomized(cfg, num_envs=N, **arguments):
+    """Return an environment that begins in the default pose, with the randomisation cfg; arguments: of `make_env`."""
     task = resetting(dataclasses.replace(TASK, randomization=cfg), only("default"))
     return make_env(num_envs, task=task, **({"randomize": True} | arguments))
 

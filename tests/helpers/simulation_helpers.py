@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import POS, QUAT
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
 from solver_helpers import BODIES, SHANKS, random_states
@@ -17,6 +18,7 @@ PAW_RADIUS = 0.025
 
 
 def simulation(num_worlds, **arguments):
+    """Return a `Simulation` on the CPU without visual shapes; arguments: of `Simulation`."""
     return Simulation(num_worlds, visuals=False, device="cpu", **arguments)
 
 
@@ -44,7 +46,7 @@ def paw_centres(sim):
     """Return the paw centres [m], (num_worlds, 4, 3)."""
     poses = sim.state.body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
     arm = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).apply([0.0, 0.0, -0.3]).reshape(-1, 4, 3)
-    return poses[..., :3] + arm
+    return poses[..., POS] + arm
 
 
 def slip_velocities(sim, joint_q):
@@ -85,7 +87,7 @@ def slope(degrees, height=0.0):
 def tilted(sim, degrees):
     """Place all robots on a slope, the base parallel to it, and return its rotation."""
     q, turn = sim.joint_q().copy(), Rotation.from_euler("y", -degrees, degrees=True)
-    q[:, :3], q[:, 3:7] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
+    q[:, POS], q[:, QUAT] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
     write_state(sim, q)
     return turn
 

@@ -7,15 +7,15 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import ANG_VEL, COORDS, DOFS, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, POS, QUAT
 from jumper_warp.robot.description import LEGS, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.dynamics import JumperDynamics
 
-COORDS, DOFS, BODIES = 43, 38, 21
-MOTORS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
+BODIES = 21  # links of a robot
 KNEES = np.array([5 * leg + joint for leg in range(4) for joint in (2, 4)])
-MOTOR_Q, MOTOR_V, KNEE_V = 7 + MOTORS, 6 + MOTORS, 6 + KNEES
+KNEE_V = 6 + KNEES  # columns of joint_qd
 SHANKS = np.array([5, 10, 15, 20])  # Bodies that carry the paws
 OPEN_STOPS = 0.35  # [rad] Random states keep this far from the stops
 
@@ -34,13 +34,13 @@ class States:
     def joint_q(self) -> np.ndarray:
         """Return Newton's joint_q with zeros for the passive joints, (n * 43,)."""
         q = np.zeros((len(self.pos), COORDS))
-        q[:, :3], q[:, 3:7], q[:, MOTOR_Q] = self.pos, self.quat, self.angles
+        q[:, POS], q[:, QUAT], q[:, MOTOR_COORDS] = self.pos, self.quat, self.angles
         return q.ravel()
 
     def joint_qd(self) -> np.ndarray:
         """Return Newton's joint_qd with zeros for the passive joints, (n * 38,)."""
         qd = np.zeros((len(self.pos), DOFS))
-        qd[:, :3], qd[:, 3:6], qd[:, MOTOR_V] = self.com_vel, self.ang_vel, self.rates
+        qd[:, LIN_VEL], qd[:, ANG_VEL], qd[:, MOTOR_DOFS] = self.com_vel, self.ang_vel, self.rates
         return qd.ravel()
 
     @classmethod
@@ -48,8 +48,8 @@ class States:
         """Return the states in Newton's arrays."""
         q = joint_q.reshape(-1, COORDS).astype(float)
         qd = joint_qd.reshape(-1, DOFS).astype(float)
-        quat = q[:, 3:7] / np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
-        return cls(q[:, :3], quat, qd[:, :3], qd[:, 3:6], q[:, MOTOR_Q], qd[:, MOTOR_V])
+        quat = q[:, QUAT] / np.linalg.norm(q[:, QUAT], axis=1, keepdims=True)
+        return cls(q[:, POS], quat, qd[:, LIN_VEL], qd[:, ANG_VEL], q[:, MOTOR_COORDS], qd[:, MOTOR_DOFS])
 
 
 def random_states(n: int, seed: int, body_rate: float = 2.0, joint_rate: float = 4.0) -> States:
@@ -91,7 +91,7 @@ class Flight:
         """Return the states after `steps` steps; torque [N m] (n, 12); wrenches (n, 6) on the base."""
         n = len(states.pos)
         joint_f = np.zeros((n, DOFS))
-        joint_f[:, MOTOR_V], joint_f[:, :6] = torque, base_joint_f
+        joint_f[:, MOTOR_DOFS], joint_f[:, :6] = torque, base_joint_f
         wrench = np.zeros((n, BODIES, 6))
         if body_f is not None:
             wrench[:, 0] = body_f
@@ -117,7 +117,7 @@ class Reference:
         self._mass, self._com = model.body_mass.numpy().astype(float), model.body_com.numpy().astype(float)
         self._inertia = model.body_inertia.numpy().astype(float)
         armature = np.zeros(self.robot.model.nv)
-        armature[self.robot.motor_v] = model.joint_armature.numpy()[MOTOR_V]
+        armature[self.robot.motor_v] = model.joint_armature.numpy()[MOTOR_DOFS]
         self.robot.model.armature = armature
         self.robot.model.gravity.linear = model.gravity.numpy()[0].astype(float)
         self.use_world(0)

@@ -50,6 +50,7 @@ class PushTask:
         self.show_critic(self.critic_obs, self.obs)
 
     def show_critic(self, critic_obs: torch.Tensor, obs: torch.Tensor) -> None:
+        """Write the critic's observation: position, velocity, distance."""
         critic_obs.copy_(torch.cat([obs, obs[:, :1].abs()], dim=1))
 
     def step(self, action: torch.Tensor) -> None:
@@ -79,6 +80,7 @@ class PushTask:
         return {"episode_length": self.episode_length}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return copies of the tensors in STATE by name."""
         return {name: getattr(self, name).clone() for name in self.STATE}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
@@ -107,10 +109,12 @@ def fill(ppo: Ppo, worlds: slice, num_worlds: int) -> None:
 
 
 def local_order(rank: int, size: int) -> torch.Tensor:
+    """Return a process's random order of `size` samples, by its rank as seed."""
     return torch.randperm(size, generator=torch.Generator().manual_seed(rank))
 
 
 def equal(a, b) -> bool:
+    """Return whether two nested dicts and lists have equal tensors and values."""
     if isinstance(a, (dict, list)):
         keys = a.keys() if isinstance(a, dict) else range(len(a))
         return len(a) == len(b) and all(equal(a[key], b[key]) for key in keys)
@@ -118,12 +122,14 @@ def equal(a, b) -> bool:
 
 
 def free_port() -> int:
+    """Return a TCP port of this computer that no process uses."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 def join(rank: int, port: int) -> None:
+    """Set the environment variables by which a process joins a group of two."""
     os.environ.update(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1")
     os.environ["MASTER_PORT"] = str(port)
 

@@ -14,7 +14,7 @@ from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.results import starts_agree
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # number of residuals, number of fitted parameters, residuals that vary as one, limit of χ²/n
     ("count", "fitted", "correlation", "limit"),
     [
         (100, 0.0, 1.0, 124.342 / 100),  # tables of the χ² distribution at 5 %
@@ -27,14 +27,15 @@ def test_chi2_limit_is_that_of_chi2_tables(count, fitted, correlation, limit):
 
 
 def test_variance_factor_of_autoregressive_residuals_is_that_of_bartlett():
-    rng, noise = np.random.default_rng(0), np.zeros((12, 4000))
+    rng, noise, memory = np.random.default_rng(0), np.zeros((12, 4000)), 0.6
     white = rng.normal(size=noise.shape)
     for i in range(1, noise.shape[1]):
-        noise[:, i] = 0.6 * noise[:, i - 1] + white[:, i]
+        noise[:, i] = memory * noise[:, i - 1] + white[:, i]
     assert variance_factor(white) == pytest.approx(1.0, abs=0.01)
-    assert variance_factor(noise) == pytest.approx((1.0 + 0.36) / (1.0 - 0.36), rel=0.05)
+    assert variance_factor(noise) == pytest.approx((1.0 + memory**2) / (1.0 - memory**2), rel=0.05)  # Bartlett
 
 
+# excess: cost of each start's fit above that of the best, sorted
 @pytest.mark.parametrize(("excess", "agree"), [([0.0], False), ([0.0, 1.0], True), ([0.0, 20.0, 21.0], False)])
 def test_starts_agree_if_the_second_best_costs_little_more(excess, agree):
     assert starts_agree(excess) is agree

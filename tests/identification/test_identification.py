@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from columns import Z
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
@@ -51,6 +52,7 @@ def test_replay_matches_simulation_of_a_robot_with_all_parameters_changed(replay
 
 
 def test_torque_is_linear_in_a_latency_below_a_physics_step(replay):
+    """A motor follows its old target for a part of the physics step, so torque mixes in proportion to the latency."""
     parameters = jumper_parameters(["latency"])
     plan = sample_plan("hung chirp", np.random.default_rng(0), seconds=0.5)
     torques = []  # [N m] of FL_outer in row 4, the first of the second target
@@ -64,9 +66,10 @@ def test_torque_is_linear_in_a_latency_below_a_physics_step(replay):
 
 
 def test_stance_has_the_models_height():
+    """On all paws in the nominal pose the base is as high above the ground as in the simulation's start state."""
     robot = load_description()
     height = stance(robot, robot.pose("nominal")[None], np.zeros((1, 12))).height[0]
-    assert height == pytest.approx(standing_configuration(robot, "nominal")[2], abs=1e-9)  # [m]
+    assert height == pytest.approx(standing_configuration(robot, "nominal")[Z], abs=1e-9)  # [m]
 
 
 def test_stance_velocity_minimises_paw_velocities():
@@ -117,7 +120,7 @@ def test_residuals_of_a_standing_robot_are_linear_in_its_initial_state(standing,
     lower = np.linalg.cholesky(square[np.ix_(unknown, unknown)])
     move[unknown] = np.linalg.solve(lower.T, np.random.default_rng(1).normal(size=len(unknown)))
     both = problem.residuals(replay, np.repeat(truth[None], 2, axis=0), np.stack([start, start + move]))
-    change, expected = both[:, 1] - both[:, 0], slope @ move
+    change, expected = both[:, 1] - both[:, 0], slope @ move  # columns of both: start, start + move
     assert np.linalg.norm(expected) > 1.0
     assert np.linalg.norm(change - expected) < 0.05 * np.linalg.norm(expected)
 
@@ -226,6 +229,7 @@ def test_identify_refuses_no_motions():
 
 
 def test_normalised_inverts_values():
+    """Parameters in physical units are turned back into the same normalised ones, z (robots, parameters)."""
     parameters = jumper_parameters()
     z = np.random.default_rng(0).normal(size=(3, len(parameters)))
     np.testing.assert_allclose(parameters.normalised(parameters.values(z)), z, atol=1e-9)

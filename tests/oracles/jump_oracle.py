@@ -6,12 +6,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, POS, QUAT, XY, Z
 from jump_helpers import DEFAULT_ANGLE
 
 DT = 1.0 / 60.0  # [s] policy step
 CONTACT_FORCE = 0.1  # [N] a paw with more is down
 G = 9.81  # [m/s^2]
-SLOTS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])  # the motors among the 20 leg joints
 TRANSVERSAL = np.arange(12) % 3 != 0  # mask of the outer and inner motors among the 12
 STANCE, FLIGHT, LANDED = 0, 1, 2
 EPISODE = """goal heading start phase phase_steps steps command_step took_off touched_down at_apex apex_passed
@@ -26,16 +26,16 @@ def robot_of(env) -> dict[str, np.ndarray]:
     (4, worlds); paws [m], (4, worlds, 3). clipped: sum of squared target corrections [rad^2]; and the fields EPISODE.
     """
     q, qd = env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
-    turn = Rotation.from_quat(q[:, 3:7])
+    turn = Rotation.from_quat(q[:, QUAT])
     com = env.sim.model.body_com.numpy().reshape(len(q), -1, 3)[:, 0]
     views, tasks = env.robot, env.skills[0].states.numpy()
     robot = {
-        "pos": q[:, :3],
-        "quat": q[:, 3:7],
-        "vel": qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(com)),
-        "spin": qd[:, 3:6],
-        "angle": q[:, 7 + SLOTS].T,
-        "rate": qd[:, 6 + SLOTS].T,
+        "pos": q[:, POS],
+        "quat": q[:, QUAT],
+        "vel": qd[:, LIN_VEL] - np.cross(qd[:, ANG_VEL], turn.apply(com)),
+        "spin": qd[:, ANG_VEL],
+        "angle": q[:, MOTOR_COORDS].T,
+        "rate": qd[:, MOTOR_DOFS].T,
         "torque": views.torque.numpy().astype(float),
         "action": views.action.numpy().astype(float),
         "force": np.linalg.norm(views.paw_force.numpy().astype(float), axis=2),
@@ -104,7 +104,7 @@ def posture(robot, width, shift=0.0):
 
 def tilt_sine(robot):
     """Return the sine of the angle between body z and world z."""
-    return norm(Rotation.from_quat(robot["quat"]).apply([0.0, 0.0, 1.0])[:, :2])
+    return norm(Rotation.from_quat(robot["quat"]).apply([0.0, 0.0, 1.0])[:, XY])
 
 
 def rotation_error(robot):
@@ -115,7 +115,7 @@ def rotation_error(robot):
 
 def goal_distance(robot):
     """Return the horizontal distance [m] of the base from the goal."""
-    return norm(robot["goal"][:, :2] - robot["pos"][:, :2])
+    return norm(robot["goal"][:, XY] - robot["pos"][:, XY])
 
 
 def landing_error(robot, height):
@@ -125,9 +125,9 @@ def landing_error(robot, height):
     """
     distances = []
     for pos, vel, goal in zip(robot["pos"], robot["vel"], robot["goal"], strict=True):
-        times = np.roots([-0.5 * G, vel[2], pos[2] - height])
-        time = max(times.real.max(), 0.0) if np.isreal(times).all() else max(vel[2] / G, 0.0)
-        distances.append(np.linalg.norm(pos[:2] + time * vel[:2] - goal[:2]))
+        times = np.roots([-0.5 * G, vel[Z], pos[Z] - height])
+        time = max(times.real.max(), 0.0) if np.isreal(times).all() else max(vel[Z] / G, 0.0)
+        distances.append(np.linalg.norm(pos[XY] + time * vel[XY] - goal[XY]))
     return np.array(distances)
 
 
@@ -141,8 +141,8 @@ def deceleration(robot):
 
 def capture_offset(robot):
     """Return the capture point (of a pendulum of the base's height) relative to the paws' mean [m], (worlds, 2)."""
-    omega = np.sqrt(G / robot["pos"][:, 2])
-    return (robot["pos"] + robot["vel"] / omega[:, None] - robot["paws"].mean(axis=0))[:, :2]
+    omega = np.sqrt(G / robot["pos"][:, Z])
+    return (robot["pos"] + robot["vel"] / omega[:, None] - robot["paws"].mean(axis=0))[:, XY]
 
 
 def symmetry(robot, params):
@@ -159,16 +159,16 @@ def left_right_difference(robot):
 
 def estimated_apex(robot):
     """Return the height [m] of the base at the apex of free fall."""
-    return robot["pos"][:, 2] + np.maximum(robot["vel"][:, 2], 0.0) ** 2 / (2.0 * G)
+    return robot["pos"][:, Z] + np.maximum(robot["vel"][:, Z], 0.0) ** 2 / (2.0 * G)
 
 
 TERMS = {
-    "jump_height": lambda r, p: r["at_apex"] * height_kernel(r["max_height"] - r["goal"][:, 2], p),
+    "jump_height": lambda r, p: r["at_apex"] * height_kernel(r["max_height"] - r["goal"][:, Z], p),
     "estimated_jump_height": lambda r, p: (
-        ((r["phase"] == FLIGHT) & (r["apex_passed"] == 0)) * height_kernel(estimated_apex(r) - r["goal"][:, 2], p)
+        ((r["phase"] == FLIGHT) & (r["apex_passed"] == 0)) * height_kernel(estimated_apex(r) - r["goal"][:, Z], p)
     ),
     "horizontal_velocity": lambda r, p: (
-        np.exp(-norm(r["vel"][:, :2]) / p["speed_scale"])
+        np.exp(-norm(r["vel"][:, XY]) / p["speed_scale"])
         * np.where(r["phase"] == STANCE, 1.0, 2.0)
         * patience(r, p["waiting_scale"])
     ),
@@ -192,7 +192,7 @@ TERMS = {
         )
     ),
     "flight_orientation": lambda r, p: (
-        ((r["phase"] == FLIGHT) & (np.sum((r["goal"] - r["pos"])[:, :2] * r["vel"][:, :2], axis=1) > 0.0))
+        ((r["phase"] == FLIGHT) & (np.sum((r["goal"] - r["pos"])[:, XY] * r["vel"][:, XY], axis=1) > 0.0))
         * phi(rotation_error(r), p["std"])
     ),
     "flight_angular_velocity": lambda r, p: (r["phase"] == FLIGHT) * phi(norm(r["spin"]), p["std"]),
@@ -203,7 +203,7 @@ TERMS = {
     ),
     "landing_tilt": lambda r, p: (r["phase"] == LANDED) * (tilt_sine(r) / np.sin(p["angle"])) ** 2,
     "descent_tilt": lambda r, p: (
-        (r["phase"] == FLIGHT) * (r["vel"][:, 2] <= 0.0) * (tilt_sine(r) / np.sin(p["angle"])) ** 2
+        (r["phase"] == FLIGHT) * (r["vel"][:, Z] <= 0.0) * (tilt_sine(r) / np.sin(p["angle"])) ** 2
     ),
     "lifted_again": lambda r, p: (
         (r["phase"] == LANDED)
@@ -221,7 +221,7 @@ TERMS = {
     "force_ripple": lambda r, p: should_rest(r) * np.sum(((r["peak"] - r["force"]) / p["weight_force"]) ** 2, axis=0),
     "soft_impact": lambda r, p: just_landed(r) * np.maximum(1.0 - deceleration(r) / p["limit"], 0.0),
     "stance_impact": lambda r, p: -1.0 * (r["phase"] == STANCE) * np.minimum(deceleration(r) / p["limit"], 1.0),
-    "catch_landing": lambda r, p: just_landed(r) * np.clip(-r["vel"][:, 2], 0.0, 1.0),
+    "catch_landing": lambda r, p: just_landed(r) * np.clip(-r["vel"][:, Z], 0.0, 1.0),
     "damp_landing": lambda r, p: just_landed(r) * np.clip(r["rate"][TRANSVERSAL], 0.0, 1.0).mean(axis=0),
     "ground_force": lambda r, p: np.sum(r["force"] ** 2, axis=0) / p["weight_force"] ** 2,
     "action_clip": lambda r, p: r["clipped"],

@@ -506,6 +506,7 @@ def test_onnx_is_one_file_and_reproducible(folder, trained):
 
 
 def test_repeated_diagonal_block_is_stored_once(tmp_path):
+    """A weight of two equal diagonal blocks and zeros; it is stored whole if a zero is another one bitwise."""
     torch.manual_seed(0)
     block = torch.randn(8, 16)
     layers = [(torch.randn(32, 4), torch.randn(32)), (torch.block_diag(block, block), torch.randn(16)),

@@ -30,7 +30,7 @@ def test_actor_and_critic_get_their_own_statistics():
         torch.testing.assert_close(features, (raw - raw.mean(0)) / raw.std(0, correction=0), atol=1e-4, rtol=1e-4)
 
 
-def test_critic_without_privileged_observation_gets_the_actors():
+def test_critic_without_privileged_observation_gets_the_actors_observation():
     ppo = Ppo(PushTask(4, episode_length=3), dataclasses.replace(SHORT, asymmetric_critic=False))
     ppo.env.reset()
     ppo.collect()

@@ -8,7 +8,7 @@ from jumper_warp.rl.graphs import CapturedProcedure
 def failing_capture(monkeypatch):
     """Replace torch in `graphs` by a stub in which every capture raises, and other calls of torch.cuda do nothing."""
 
-    def refuse(*_, **__):
+    def refuse(*_, **__):  # as CUDA does where a stream may not be captured
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
     class Cuda:  # every other attribute is a function that does nothing
@@ -17,7 +17,7 @@ def failing_capture(monkeypatch):
         def __getattr__(self, name):
             return lambda: None
 
-    class Torch:
+    class Torch:  # stub of the module
         cuda = Cuda()
 
     monkeypatch.setattr(graphs, "torch", Torch())

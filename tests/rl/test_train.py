@@ -279,6 +279,7 @@ def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
 
 
 def test_every_logged_metric_can_be_the_best_metric(cfg):
+    """A training is set up with the name of each metric that another one logged; a wrong name raises an error."""
     metrics = train(cfg, make_env).metrics
     for name in metrics:
         TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))

@@ -10,6 +10,7 @@ from jumper_warp.robot.description import knee_angles, leg_dimensions, load_desc
 
 @pytest.fixture(scope="module")
 def description():
+    """Return the description of the robot."""
     return load_description()
 
 

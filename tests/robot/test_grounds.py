@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from columns import X, Z
 from ground_helpers import heights, probe
 from jumper_warp.robot import grounds
 from simulation_helpers import PAW_RADIUS, WEIGHT, paw_centres, paw_forces, simulation, thrown, write_state
@@ -77,8 +78,8 @@ def dropped(field, offset, lift, num_worlds=1):
     """Return a simulation of robots in the standing pose at x = offset [m], paws at z = lift [m], before they fall."""
     sim = simulation(num_worlds, ground=field)
     q = sim.joint_q().copy()
-    q[:, 0] += offset
-    q[:, 2] += lift
+    q[:, X] += offset
+    q[:, Z] += lift
     write_state(sim, q)
     return sim
 
@@ -116,6 +117,6 @@ def test_robots_thrown_across_an_edge_stay_slow_finite_and_above_ground():
         assert np.abs(sim.base_velocity()).max() < 8.0  # [m/s]
     assert not sim.solver.diverged.numpy().any()
     paws = paw_centres(sim)
-    before_edge = paws[..., 0] < 0.3 - PAW_RADIUS
+    before_edge = paws[..., X] < 0.3 - PAW_RADIUS
     assert paws[before_edge][:, 2].min() > PAW_RADIUS - 5e-3  # 5 mm of penetration
-    assert paws[..., 2].min() > -0.15 + PAW_RADIUS - 5e-3
+    assert paws[..., Z].min() > -0.15 + PAW_RADIUS - 5e-3

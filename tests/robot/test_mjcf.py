@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from columns import Z
 from jumper_warp.cli.main import main
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, load_description
 from jumper_warp.robot.export import export_robot
@@ -82,6 +83,7 @@ def mass_matrix(model, qpos):
 
 
 def test_accelerations_agree_with_rigid_loops_of_pinocchio():
+    """Base and motors of ten robots at rest in the air accelerate alike under random motor torques."""
     model, data = load()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
     model.eq_solimp[:, :2] = 0.9999  # nearly rigid loops
@@ -141,9 +143,9 @@ def test_motors_and_knee_dampers_stay_within_their_torques():
 
 def test_paws_grip_as_described_on_any_ground_and_pass_through_each_other():
     model, data = load()
-    model.geom("ground").friction[0] = 3.0
+    model.geom("ground").friction[0] = 3.0  # which MuJoCo must not use
     mujoco.mj_forward(model, data)
-    data.qpos[2] -= 0.001
+    data.qpos[Z] -= 0.001  # [m] into the ground
     mujoco.mj_forward(model, data)
     assert data.ncon == 4 and all(contact.friction[0] == pytest.approx(0.9) for contact in data.contact)
     paws = [model.geom(f"{leg}_paw") for leg in LEGS]

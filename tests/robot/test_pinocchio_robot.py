@@ -14,6 +14,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
 
 @pytest.fixture(scope="module")
 def robot():
+    """Return Pinocchio's model of the robot."""
     return build_pinocchio(load_description())
 
 

@@ -11,26 +11,27 @@ import warp as wp
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS, POS, X, Y, Z
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, leg_geometry, leg_geometry_array, standing_configuration
 from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
 
-COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
 LEGS = ("FL", "FR", "BL", "BR")
 FRONT = np.array([1, 1, -1, -1])  # sign of x by leg
 SIDE = np.array([1, -1, 1, -1])  # sign of y by leg
-MOTOR_DOFS = np.array([6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 
 
 @pytest.fixture(scope="module")
 def description():
+    """Return the description of the robot."""
     return load_description()
 
 
 @pytest.fixture(scope="module")
 def model():
+    """Return Newton's model of two robots in the default pose on a plane."""
     return build_model(2, device="cpu")
 
 
@@ -42,7 +43,7 @@ def body_poses(model, joint_q):
     state.joint_q.assign(coords)
     newton.eval_fk(model, state.joint_q, state.joint_qd, state)
     poses = state.body_q.numpy()[:21].astype(float)
-    return poses[:, :3], Rotation.from_quat(poses[:, 3:])
+    return poses[:, POS], Rotation.from_quat(poses[:, 3:])
 
 
 def far_ends(model, joint_q, link, length):
@@ -85,15 +86,15 @@ def test_motor_and_knee_properties(model):
 
 
 def test_default_pose_stands_on_closed_legs(model):
-    joint_q = model.joint_q.numpy()[COORDS:]
+    joint_q = model.joint_q.numpy()[COORDS:]  # of world 1
     # base height: ankle depth 0.3718 at 45 degrees plus the paw radius
-    assert joint_q[2] == pytest.approx(0.3718 + 0.025, abs=5e-5)
+    assert joint_q[Z] == pytest.approx(0.3718 + 0.025, abs=5e-5)
     outer, inner = (far_ends(model, joint_q, link, length=0.3) for link in (2, 4))  # ankles by both shanks
     assert inner == pytest.approx(outer, abs=1e-6)
-    assert inner[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
+    assert inner[:, Z] == pytest.approx(np.full(4, 0.025), abs=1e-6)
     # below the middle between the transversal axes, x = 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075
-    assert inner[:, 0] == pytest.approx(0.24 * FRONT, abs=1e-6)
-    assert inner[:, 1] == pytest.approx(SIDE * (np.array([0.105, 0.105, 0.15, 0.15]) + 0.0602), abs=1e-6)
+    assert inner[:, X] == pytest.approx(0.24 * FRONT, abs=1e-6)
+    assert inner[:, Y] == pytest.approx(SIDE * (np.array([0.105, 0.105, 0.15, 0.15]) + 0.0602), abs=1e-6)
 
 
 def test_loop_coordinates_are_relative_rotations_of_shanks(model):
@@ -108,18 +109,20 @@ def test_loop_coordinates_are_relative_rotations_of_shanks(model):
 def test_positive_lateral_swings_the_paw_outward(model):
     joint_q = model.joint_q.numpy()[:COORDS].astype(float)
     before = far_ends(model, joint_q, link=4, length=0.3)
-    joint_q[7:27:5] += 0.1  # [rad] all laterals
+    joint_q[MOTOR_COORDS[0::3]] += 0.1  # [rad] all laterals
     moved = far_ends(model, joint_q, link=4, length=0.3) - before
-    assert (SIDE * moved[:, 1] > 0.03).all()
+    assert (SIDE * moved[:, Y] > 0.03).all()
 
 
-@pytest.mark.parametrize(("joint", "link", "direction"), [(1, 1, 1), (3, 3, -1)], ids=["outer", "inner"])
+@pytest.mark.parametrize(  # joint and link among the five of a leg; direction: 1 away from the robot's centre
+    ("joint", "link", "direction"), [(1, 1, 1), (3, 3, -1)], ids=["outer", "inner"]
+)
 def test_positive_thigh_angle_moves_its_tip_away_from_its_twin(model, joint, link, direction):
     joint_q = model.joint_q.numpy()[:COORDS].astype(float)
     before = far_ends(model, joint_q, link, 0.175)
     joint_q[7 + joint : 27 : 5] += 0.1
     moved = far_ends(model, joint_q, link, 0.175) - before
-    assert (direction * FRONT * moved[:, 0] > 0.01).all()
+    assert (direction * FRONT * moved[:, X] > 0.01).all()
 
 
 @pytest.mark.parametrize("joint", [2, 4], ids=["outer", "inner"])
@@ -130,7 +133,7 @@ def test_positive_knee_angle_folds_the_shank_under_the_body(model, joint):
     joint_q[7 + joint : 27 : 5] += 0.1
     moved = far_ends(model, joint_q, joint, 0.3) - before
     direction = -1 if joint == 2 else 1
-    assert (direction * FRONT * moved[:, 0] > 0.01).all()
+    assert (direction * FRONT * moved[:, X] > 0.01).all()
 
 
 def test_nominal_pose_stands_at_the_nominal_height(description):
@@ -141,7 +144,7 @@ def test_standing_height_with_the_legs_swung_outward(model, description):
     swung = dataclasses.replace(description, poses={"swung": (math.radians(30.0), math.radians(60.0))})
     paws = far_ends(model, standing_configuration(swung, "swung"), 4, 0.3)
     # the hips are level, and all legs have equal angles
-    assert paws[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
+    assert paws[:, Z] == pytest.approx(np.full(4, 0.025), abs=1e-6)
 
 
 def test_leg_geometry_matches_joint_origins(description):
@@ -158,15 +161,15 @@ def test_leg_geometry_array_in_both_precisions(description, package, bits):
     module = importlib.import_module(f"{package}.kinematics.geometry")
     legs = leg_geometry_array(description, module, device="cpu").numpy()
     assert legs["thigh"].dtype == f"float{bits}"
-    assert legs["outer_x"] == pytest.approx(0.1417 * FRONT, rel=1e-6)
-    assert legs["hip"][:, 1] == pytest.approx([0.105, -0.105, 0.15, -0.15], rel=1e-6)
+    assert legs["outer_x"] == pytest.approx(0.1417 * FRONT, rel=1e-6)  # [m], as in the test above
+    assert legs["hip"][:, Y] == pytest.approx([0.105, -0.105, 0.15, -0.15], rel=1e-6)  # FL, FR, BL, BR
 
 
 def test_only_paws_collide_with_the_ground():
     solver = mujoco_solver(build_model(1, visuals=False, device="cpu"))
     kind, affinity = solver.mj_model.geom_contype, solver.mj_model.geom_conaffinity
     collides = (kind[:, None] & affinity[None, :]) | (kind[None, :] & affinity[:, None])
-    # the ground is global and comes first
+    # the ground belongs to no world and comes first
     assert collides[0, 1:].all()
     assert not collides[1:, 1:].any()
 
@@ -210,7 +213,7 @@ def test_robot_stands_at_the_height_of_least_energy_with_closed_loops():
     damping = np.array([1.8, 0.8, 0.8] * 4)
     torque = np.zeros(DOFS, dtype=np.float32)
     for _ in range(200):  # 0.42 s
-        angle, rate = state.joint_q.numpy()[MOTOR_DOFS + 1], state.joint_qd.numpy()[MOTOR_DOFS]
+        angle, rate = state.joint_q.numpy()[MOTOR_COORDS], state.joint_qd.numpy()[MOTOR_DOFS]
         torque[MOTOR_DOFS] = 17.0 * (target - angle) - damping * rate
         control.joint_f.assign(torque)
         solver.step(state, state, control, None, 1.0 / 480.0)
@@ -236,7 +239,7 @@ def test_accelerations_in_flight_agree_with_pinocchio(description):
     model.joint_friction.zero_()
     joint_q = model.joint_q.numpy()
     joint_q[:7] = q[:7]
-    joint_q[MOTOR_DOFS + 1] = motors
+    joint_q[MOTOR_COORDS] = motors
     knees = np.array([9 + 5 * leg + 2 * bar for leg in range(4) for bar in (0, 1)])
     joint_q[knees] = q[reference.knee_q]
     model.joint_q.assign(joint_q)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from columns import MOTOR_DOFS, QUAT, XY, Z
 from jumper_warp.robot.grounds import BlockCfg, uneven
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
 
 N = 11  # worlds, not a multiple of the 8 worlds that share a warp
-MOTORS = [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]  # in joint_qd
 
 
 @pytest.fixture(autouse=True)
@@ -24,15 +24,15 @@ def states(model, height, seed=0):
     """Return random joint_q (N, 43), joint_qd (N, 38), joint_f (N, 38) of robots with the base near a height [m]."""
     rng = np.random.default_rng(seed)
     q = model.joint_q.numpy().reshape(N, 43).astype(np.float64)
-    q[:, :2] = rng.normal(size=(N, 2)) * 0.3
-    q[:, 2] = height + rng.uniform(-0.04, 0.04, N)
+    q[:, XY] = rng.normal(size=(N, 2)) * 0.3
+    q[:, Z] = height + rng.uniform(-0.04, 0.04, N)
     tilt = np.column_stack([rng.normal(size=(N, 2)) * 0.05, rng.normal(size=N), np.ones(N)])
-    q[:, 3:7] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+    q[:, QUAT] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
     qd = np.zeros((N, 38))
     qd[:, :6] = rng.normal(size=(N, 6)) * 0.4
-    qd[:, MOTORS] = rng.normal(size=(N, 12))
+    qd[:, MOTOR_DOFS] = rng.normal(size=(N, 12))
     force = np.zeros((N, 38))
-    force[:, MOTORS] = rng.uniform(-12.0, 12.0, (N, 12))
+    force[:, MOTOR_DOFS] = rng.uniform(-12.0, 12.0, (N, 12))
     return q, qd, force
 
 

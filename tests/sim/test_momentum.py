@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from columns import ANG_VEL, XY, Z
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
@@ -16,9 +17,9 @@ def moving_legs(keep: bool, *, height: float, push: float = 0.0, reach: float = 
     """Return a simulation after leg motion of `reach` [rad] at `height` [m], and its momenta after every step."""
     sim = Simulation(N, motors=jumping_motors(), gravity=MARS, keep_momentum=keep, visuals=False, device="cpu")
     q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
-    q[:, 2] += height
+    q[:, Z] += height
     if height:
-        qd[:, 3:6] = [0.5, -0.3, 0.2]
+        qd[:, ANG_VEL] = [0.5, -0.3, 0.2]
     sim.state.joint_q.assign(q.ravel())
     sim.state.joint_qd.assign(qd.ravel())
     wrench = np.zeros((N, 21, 6), dtype=np.float32)
@@ -44,8 +45,8 @@ def test_momentum_changes_by_gravity_alone_in_flight(flights):
     mass = sim.model.body_mass.numpy()[:21].sum()
     time = np.arange(STEPS + 1) / 60.0
     linear, angular = (np.array([pair[i] for pair in projected]) for i in (0, 1))  # (STEPS + 1, N, 3)
-    np.testing.assert_allclose(linear[:, :, 2] - linear[0, :, 2], np.outer(-mass * MARS * time, np.ones(N)), atol=1e-3)
-    np.testing.assert_allclose(linear[:, :, :2], np.tile(linear[0, :, :2], (STEPS + 1, 1, 1)), atol=1e-4)
+    np.testing.assert_allclose(linear[:, :, Z] - linear[0, :, 2], np.outer(-mass * MARS * time, np.ones(N)), atol=1e-3)
+    np.testing.assert_allclose(linear[:, :, XY], np.tile(linear[0, :, :2], (STEPS + 1, 1, 1)), atol=1e-4)
     np.testing.assert_allclose(angular, np.tile(angular[0], (STEPS + 1, 1, 1)), atol=2e-5)
     drift = np.abs(np.array([pair[1] for pair in flights[False][1]]) - angular[0]).max()
     assert np.abs(angular).max() > 0.2 and drift > 1e-3  # [kg m^2/s]; drift without projection

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from columns import COORDS, MOTOR_DOFS, XY, X, Y, Z
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.collision.robot import SHANK_GROUND, collision_kernel
 from jumper_warp.kernels.dynamics.contact import BlockLaw, PawContact, block_velocity, push_on_block
@@ -24,7 +25,7 @@ from simulation_helpers import (
     thrown,
     write_state,
 )
-from solver_helpers import COORDS, MOTOR_V, Reference, States
+from solver_helpers import Reference, States
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,7 +41,7 @@ def on_block(num_worlds, settle=60, **block):
     arguments = {"friction": arguments.pop("friction_paws", 0.9), **arguments}
     sim = simulation(num_worlds, block=BlockCfg(**(WIDE | block)), **arguments)
     q = sim.joint_q().copy()
-    q[:, 2] += TOP
+    q[:, Z] += TOP
     write_state(sim, q)
     for _ in range(settle):
         sim.step()
@@ -103,7 +104,7 @@ def test_block_stays_at_rest_under_a_standing_robot():
         sim.step()
     assert np.abs(sim.solver.block_position()).max() < 1e-3
     assert np.abs(paw_centres(sim) - paws).max() < 1e-3
-    assert paw_centres(sim)[..., 2] == pytest.approx(TOP + PAW_RADIUS, abs=1e-3)
+    assert paw_centres(sim)[..., Z] == pytest.approx(TOP + PAW_RADIUS, abs=1e-3)
     assert paw_forces(sim).sum(axis=1) == pytest.approx(np.tile([0.0, 0.0, WEIGHT], (2, 1)), abs=1e-3 * WEIGHT)
 
 
@@ -115,10 +116,10 @@ def test_robot_and_block_accelerate_together_under_a_force():
     sim.state.body_f.assign(wrench.reshape(-1, 6))
     for _ in range(30):
         sim.step()
-    before = sim.solver.block_velocity()[:, 0].copy()
+    before = sim.solver.block_velocity()[:, X].copy()
     for _ in range(30):
         sim.step()
-    acceleration = (sim.solver.block_velocity()[:, 0] - before) / 0.5  # 30 policy steps are 0.5 s
+    acceleration = (sim.solver.block_velocity()[:, X] - before) / 0.5  # 30 policy steps are 0.5 s
     total = MASS + masses
     assert acceleration == pytest.approx((force - friction * total * 9.81) / total, rel=0.01)
 
@@ -133,8 +134,8 @@ def test_block_momentum_matches_paw_and_floor_impulses(friction):
         before = sim.solver.block_velocity().astype(float)
         sim.physics_step()
         force, after = paw_forces(sim).sum(axis=1), sim.solver.block_velocity().astype(float)
-        lost = masses[:, None] * (before - after) - PHYSICS_DT * force[:, :2]  # [N s] to the floor
-        most = friction * PHYSICS_DT * (masses * 9.81 + force[:, 2])  # [N s] Coulomb limit
+        lost = masses[:, None] * (before - after) - PHYSICS_DT * force[:, XY]  # [N s] to the floor
+        most = friction * PHYSICS_DT * (masses * 9.81 + force[:, Z])  # [N s] Coulomb limit
         speed = np.linalg.norm(after, axis=1)
         sliding = speed > 1e-4
         expected = most[:, None] * after / np.maximum(speed, 1e-9)[:, None]
@@ -149,14 +150,14 @@ def test_landing_on_a_frictionless_block_conserves_momentum():
     sim = on_block(3, settle=0, mass=masses, friction=0.0)
     reference = Reference(sim.model)
     q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
-    q[:, 2] += 0.15
-    qd[:, 0], qd[:, 1] = 1.2, 0.3
+    q[:, Z] += 0.15
+    qd[:, X], qd[:, Y] = 1.2, 0.3
     write_state(sim, q, qd)
     before = momenta(sim, reference)
     for _ in range(24):
         sim.step()
     block = masses[:, None] * sim.solver.block_velocity()
-    assert paw_forces(sim)[..., 2].sum(axis=1).min() > 10.0
+    assert paw_forces(sim)[..., Z].sum(axis=1).min() > 10.0
     assert block[:, 0].min() > 2.0
     # tolerance: 1 % of the initial momentum, since free flight drifts by the integration error
     assert momenta(sim, reference) + block == pytest.approx(before, abs=0.01 * MASS * 1.2)
@@ -165,15 +166,15 @@ def test_landing_on_a_frictionless_block_conserves_momentum():
 def test_sticking_paws_move_with_the_block():
     sim = on_block(4, settle=20, mass=np.array([1.0, 5.0, 10.0, 100.0]), friction=0.05)
     qd = sim.joint_qd().copy()
-    qd[:, 0] = 0.5
+    qd[:, X] = 0.5
     write_state(sim, qd=qd)
     compared, fastest = 0, 0.0
     for _ in range(120):
         before = sim.joint_q().copy()
         sim.physics_step()
         force, velocity = paw_forces(sim), sim.solver.block_velocity()
-        slip = slip_velocities(sim, before)[..., :2] - velocity[:, None]
-        sticking = np.linalg.norm(force[..., :2], axis=-1) < 0.85 * force[..., 2]
+        slip = slip_velocities(sim, before)[..., XY] - velocity[:, None]
+        sticking = np.linalg.norm(force[..., XY], axis=-1) < 0.85 * force[..., Z]
         assert np.abs(slip[sticking]).max(initial=0.0) < 1e-3
         assert sim.solver.residual.numpy().max() <= TOLERANCE
         compared += sticking[:2].sum()
@@ -189,16 +190,16 @@ def test_static_friction_holds_on_a_moving_block():
     dynamics.static_friction_ratio.assign(np.array([4.0, 1.0], dtype=np.float32))
     dynamics.pack_friction()
     qd = sim.joint_qd().copy()
-    qd[:, 0] = 0.5
+    qd[:, X] = 0.5
     write_state(sim, qd=qd)
     set_block_velocity(sim, [0.5, 0.0])
-    before = paw_centres(sim)[..., :2] - sim.solver.block_position()[:, None]
+    before = paw_centres(sim)[..., XY] - sim.solver.block_position()[:, None]
     wrench = np.zeros((2, 21, 6), dtype=np.float32)
     wrench[:, 0, 0] = 0.25 * WEIGHT
     sim.state.body_f.assign(wrench.reshape(-1, 6))
     for _ in range(30):
         sim.step()
-    slipped = np.abs(paw_centres(sim)[..., :2] - sim.solver.block_position()[:, None] - before).max(axis=(1, 2))
+    slipped = np.abs(paw_centres(sim)[..., XY] - sim.solver.block_position()[:, None] - before).max(axis=(1, 2))
     assert slipped[0] < 6e-3  # the paws roll as the legs lean
     assert slipped[1] > 0.03
 
@@ -214,21 +215,22 @@ def test_robots_thrown_on_light_blocks_converge_and_stay_finite():
 
 
 def test_paws_push_the_side_of_a_block():
+    """Robots that move at 1 m/s push blocks ahead of them; momentum along x is conserved on frictionless ground."""
     masses = np.array([5.0, 15.0])
     block = BlockCfg(center=(0.9, 0.0), half=(0.4, 0.6), height=TOP, mass=masses, friction=0.0)
     sim = simulation(2, friction=0.0, block=block)
     qd = sim.joint_qd().copy()
-    qd[:, 0] = 1.0
+    qd[:, X] = 1.0
     write_state(sim, qd=qd)
     reference = Reference(sim.model)
     before = momenta(sim, reference)
     for _ in range(36):
         sim.step()
-        side = sim.solver.block_position()[:, 0] - 0.4
+        side = sim.solver.block_position()[:, X] - 0.4  # [m], which paws enter by less than 10 mm
         assert np.all(paw_centres(sim)[:, :2, 0].max(axis=1) < side - PAW_RADIUS + 0.01)
-    block = masses * sim.solver.block_velocity()[:, 0]  # [kg m/s]
+    block = masses * sim.solver.block_velocity()[:, X]  # [kg m/s]
     assert block.min() > 2.0
-    assert momenta(sim, reference)[:, 0] + block == pytest.approx(before[:, 0], abs=0.01 * before[0, 0])
+    assert momenta(sim, reference)[:, X] + block == pytest.approx(before[:, X], abs=0.01 * before[0, 0])
 
 
 @wp.kernel
@@ -297,9 +299,9 @@ def test_block_of_a_diverged_world_returns_to_its_start():
     sim = on_block(2, settle=2, mass=5.0, friction=0.0)
     set_block_velocity(sim, [[1.0, 0.0], [1.0, 0.0]])
     sim.step()
-    assert sim.solver.block_position()[:, 0].min() > 1e-3
+    assert sim.solver.block_position()[:, X].min() > 1e-3
     rates = sim.joint_qd().copy()
-    rates[0, 7] = np.nan
+    rates[0, 7] = np.nan  # FL_outer of world 0
     sim.state.joint_qd.assign(rates.ravel())
     sim.step()
     sim.step()
@@ -311,14 +313,14 @@ def test_block_of_a_diverged_world_returns_to_its_start():
 def test_block_in_single_precision_matches_double_precision():
     sim = on_block(2, settle=30, mass=np.array([5.0, 20.0]), friction=0.1)
     qd = sim.joint_qd().copy()
-    qd[:, 0] = 1.0
+    qd[:, X] = 1.0
     write_state(sim, qd=qd)
     double = JumperDynamics(sim.model, block=BlockCfg(**WIDE, mass=np.array([5.0, 20.0]), friction=0.1), double=True)
     q, qd = (wp.array(v.ravel(), dtype=wp.float64, device="cpu") for v in (sim.joint_q(), sim.joint_qd()))
     for _ in range(SUBSTEPS * 4):  # four policy steps
         sim.physics_step()
         joint_f = np.zeros((2, 38))
-        joint_f[:, MOTOR_V] = sim.torque.numpy().T
+        joint_f[:, MOTOR_DOFS] = sim.torque.numpy().T
         drive = double.drive(
             wp.array(joint_f.ravel(), dtype=wp.float64, device="cpu"),
             wp.zeros(42, dtype=wp.spatial_vector, device="cpu"),
@@ -326,7 +328,7 @@ def test_block_in_single_precision_matches_double_precision():
         double.advance(double.settings(PHYSICS_DT, 1, 50, 1.0e-9), drive, q, qd, q, qd)
     blocks = double.robot.ground.blocks.numpy()
     assert blocks["center"].dtype == np.float64
-    assert blocks["center"][:, 0].min() > 1e-3
+    assert blocks["center"][:, X].min() > 1e-3
     assert blocks["center"] == pytest.approx(sim.solver.block_position(), abs=1e-4)
 
 

@@ -6,11 +6,11 @@ import pytest
 import warp as wp
 from newton.sensors import SensorContact, SensorIMU
 
+from columns import MOTOR_COORDS, MOTOR_DOFS, Z
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.solver import SolverJumper
-from solver_helpers import MOTOR_V
 
 DT, N = 1.0 / 480.0, 2
 WEIGHT = 14.5 * 9.81  # [N]
@@ -41,25 +41,25 @@ class Robots:
         self.observables = None if legacy else self.solver.observables(kinds=kinds, contacts=self.contacts)
 
     def q(self):
+        """Return joint_q, (N, 43)."""
         return self.state.joint_q.numpy().reshape(N, -1).astype(float)
 
     def qd(self):
+        """Return joint_qd, (N, 38)."""
         return self.state.joint_qd.numpy().reshape(N, -1).astype(float)
 
     def lift(self, height):
         """Move all robots up by a height [m]."""
         q = self.q()
-        q[:, 2] += height
+        q[:, Z] += height
         self.state.joint_q.assign(q.ravel().astype(np.float32))
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def drive(self, degrees):
         """Set torques of motors that hold angles [deg] of lateral, outer and inner with 60 N m/rad and 1 N m s/rad."""
-        motors = np.array([7, 8, 10])[None, :] + 5 * np.arange(4)[:, None]
-        error = np.radians(degrees) - self.q()[:, motors]
-        rates = self.qd()[:, np.asarray(MOTOR_V).reshape(4, 3)]
+        error = np.tile(np.radians(degrees), 4) - self.q()[:, MOTOR_COORDS]
         torque = np.zeros_like(self.qd())
-        torque[:, np.asarray(MOTOR_V)] = np.clip(60.0 * error - rates, -18.0, 18.0).reshape(N, 12)
+        torque[:, MOTOR_DOFS] = np.clip(60.0 * error - self.qd()[:, MOTOR_DOFS], -18.0, 18.0)
         self.control.joint_f.assign(torque.ravel().astype(np.float32))
 
     def step(self, degrees=None):
@@ -71,9 +71,8 @@ class Robots:
             self.solver.update_contacts(self.contacts, self.state)
         self.imu.update(self.state, observables=self.observables)
         self.touch.update(self.state, self.contacts, observables=self.observables)
-        return self.imu.accelerometer.numpy().astype(float), self.touch.total_force.numpy().reshape(N, 4, 3).astype(
-            float
-        )
+        force = self.touch.total_force.numpy().reshape(N, 4, 3)
+        return self.imu.accelerometer.numpy().astype(float), force.astype(float)
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::newton.NewtonDeprecationWarning")
@@ -87,7 +86,7 @@ def test_free_fall_feels_neither_gravity_nor_ground(kind, way):
         acceleration, force = robots.step()
     # released legs fall as fast as the body
     assert np.abs(acceleration).max() < 0.05 and not force.any()
-    assert robots.qd()[:, 2] == pytest.approx(-9.81 * 20 * DT, rel=1e-2)
+    assert robots.qd()[:, Z] == pytest.approx(-9.81 * 20 * DT, rel=1e-2)
 
 
 @WAYS
@@ -97,7 +96,7 @@ def test_standing_robot_feels_gravity_and_its_weight(kind, way):
     acceleration, force = (np.mean(values, axis=0) for values in zip(*readings, strict=True))
     assert acceleration == pytest.approx(np.tile([0.0, 0.0, 9.81], (N, 1)), abs=0.15)
     assert force.sum(axis=1) == pytest.approx(np.tile([0.0, 0.0, WEIGHT], (N, 1)), abs=0.01 * WEIGHT)
-    assert (force[:, :, 2] > 0.15 * WEIGHT).all()
+    assert (force[:, :, Z] > 0.15 * WEIGHT).all()
 
 
 def push_off(kind):
@@ -105,12 +104,12 @@ def push_off(kind):
     robots = Robots(kind)
     for _ in range(120):
         robots.step((0.0, 60.0, 60.0))
-    before = robots.qd()[:, 2].copy()
+    before = robots.qd()[:, Z].copy()
     readings = [robots.step((0.0, 5.0, 5.0)) for _ in range(60)]
-    felt = sum(acceleration[:, 2] for acceleration, _ in readings) * DT - 9.81 * 60 * DT
-    pushed = sum(force[:, :, 2].sum(axis=1) for _, force in readings) * DT / 14.5 - 9.81 * 60 * DT
-    peak = max(force[:, :, 2].sum(axis=1).max() for _, force in readings)
-    return robots.qd()[:, 2] - before, felt, pushed, peak
+    felt = sum(acceleration[:, Z] for acceleration, _ in readings) * DT - 9.81 * 60 * DT
+    pushed = sum(force[:, :, Z].sum(axis=1) for _, force in readings) * DT / 14.5 - 9.81 * 60 * DT
+    peak = max(force[:, :, Z].sum(axis=1).max() for _, force in readings)
+    return robots.qd()[:, Z] - before, felt, pushed, peak
 
 
 def test_push_off_of_a_jump_is_felt_alike_on_both_solvers():

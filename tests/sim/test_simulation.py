@@ -5,6 +5,7 @@ import pytest
 import torch
 import warp as wp
 
+from columns import LIN_VEL, POS, Z
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
@@ -104,12 +105,12 @@ def test_reset_recovers_diverged_world(solver):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_standing_robot_stays_standing_after_a_reset(solver):
     sim = simulation(2, solver)
-    height = sim.joint_q()[:, 2].copy()
+    height = sim.joint_q()[:, Z].copy()
     jump(sim, 4)
     sim.reset()
     for _ in range(30):
         sim.step()
-    assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # [m] of sag on its motors
+    assert sim.joint_q()[:, Z] == pytest.approx(height, abs=0.06)  # [m] of sag on its motors
 
 
 def test_captured_filter_and_physics_match_single_calls():
@@ -192,14 +193,14 @@ def spinning(solver):
 def test_base_velocity_matches_differences_of_position(solver):
     sim = spinning(solver)
     for _ in range(5):
-        before = sim.joint_q()[:, :3].astype(float)
+        before = sim.joint_q()[:, POS].astype(float)
         sim.physics_step()
         found = sim.base_velocity()
-        expected = (sim.joint_q()[:, :3].astype(float) - before) / sim.dt
+        expected = (sim.joint_q()[:, POS].astype(float) - before) / sim.dt
         assert found.shape == (2, 3)
         # [m/s] MuJoCo integrates the mean of two velocities
         assert found == pytest.approx(expected, abs=1e-3 if solver == "jumper" else 5e-3)
-    com_velocity = sim.joint_qd()[:, :3]
+    com_velocity = sim.joint_qd()[:, LIN_VEL]
     assert np.abs(found - com_velocity).max() > 0.02  # origin and COM differ
 
 

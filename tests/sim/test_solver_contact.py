@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from columns import DOFS, MOTOR_COORDS, MOTOR_DOFS, QUAT, XY, X, Y, Z
 from jumper_warp.sim.solver import TOLERANCE
 from simulation_helpers import (
     WEIGHT,
@@ -21,7 +22,6 @@ from simulation_helpers import (
     tilted,
     write_state,
 )
-from solver_helpers import DOFS, MOTOR_Q, MOTOR_V
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_contacts_never_pull_and_stay_in_the_friction_cone():
     for _ in range(480):
         sim.physics_step()
         force = paw_forces(sim)
-        normal, tangential = force[..., 2], np.linalg.norm(force[..., :2], axis=-1)
+        normal, tangential = force[..., Z], np.linalg.norm(force[..., XY], axis=-1)
         assert normal.min() >= 0.0
         assert (tangential <= 0.6 * normal * (1.0 + 1e-4) + 1e-4).all()
         touched |= (normal > 0.0).any(axis=1)
@@ -87,10 +87,10 @@ def test_friction_never_accelerates_a_sliding_paw():
             sim.filter_targets()
         joint_q = sim.joint_q().copy()
         sim.physics_step()
-        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., :2]
-        sliding = (np.linalg.norm(slip, axis=-1) > 0.3) & (force[..., 2] > 20.0)  # [m/s], [N]
+        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., XY]
+        sliding = (np.linalg.norm(slip, axis=-1) > 0.3) & (force[..., Z] > 20.0)  # [m/s], [N]
         slides += sliding.sum()
-        assert ((force[..., :2] * slip).sum(axis=-1)[sliding] < 0.0).all()
+        assert ((force[..., XY] * slip).sum(axis=-1)[sliding] < 0.0).all()
     assert slides > 10000
 
 
@@ -98,15 +98,15 @@ def test_friction_opposes_sliding_at_mu_times_the_normal_force():
     sim = simulation(8, friction=0.3)
     qd = np.zeros((8, DOFS))
     heading = np.arange(8) * math.pi / 4.0
-    qd[:, 0], qd[:, 1] = 2.0 * np.cos(heading), 2.0 * np.sin(heading)  # [m/s]
+    qd[:, X], qd[:, Y] = 2.0 * np.cos(heading), 2.0 * np.sin(heading)  # [m/s]
     write_state(sim, qd=qd)
     checked = 0
     for _ in range(120):
         joint_q = sim.joint_q().copy()
         sim.physics_step()
-        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., :2]
+        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., XY]
         speed = np.linalg.norm(slip, axis=-1)
-        sliding = (speed > 0.2) & (force[..., 2] > 1.0)
+        sliding = (speed > 0.2) & (force[..., Z] > 1.0)
         friction, normal = force[sliding][:, :2], force[sliding][:, 2]
         checked += sliding.sum()
         assert np.linalg.norm(friction, axis=1) == pytest.approx(0.3 * normal, rel=1e-3)
@@ -174,7 +174,7 @@ def test_flat_heightfield_matches_the_plane():
     for sim in (plane, field):
         thrown(sim, seed=13, height=(0.5, 0.8), speed=0.5)
     q = field.joint_q().copy()
-    q[:, 2] += height
+    q[:, Z] += height
     write_state(field, q)
     for _ in range(20):
         plane.step()
@@ -200,7 +200,7 @@ def test_robot_survives_a_drop_from_one_metre():
 
 def worst_excess(sim, worlds=slice(None)):
     """Return the largest excess [deg] beyond the stops, of motors and of outer + inner; negative: within them."""
-    angles = np.degrees(sim.joint_q()[worlds][:, MOTOR_Q].astype(float))
+    angles = np.degrees(sim.joint_q()[worlds][:, MOTOR_COORDS].astype(float))
     total = angles[:, 1::3] + angles[:, 2::3]
     lower, upper = np.array([-50.0, -30.0, -30.0] * 4), np.array([110.0, 140.0, 140.0] * 4)
     motors = max((lower - angles).max(), (angles - upper).max())
@@ -211,8 +211,8 @@ def lowest_corner(sim):
     """Return the height [m] of the lowest corner of the body's bounding box, (num_worlds,)."""
     q = sim.joint_q()
     corners = np.array(list(itertools.product((-0.343, 0.343), (-0.2, 0.2), (-0.049, 0.099))))
-    heights = [Rotation.from_quat(quat).apply(corners)[:, 2].min() for quat in q[:, 3:7]]
-    return q[:, 2] + np.array(heights)
+    heights = [Rotation.from_quat(quat).apply(corners)[:, 2].min() for quat in q[:, QUAT]]
+    return q[:, Z] + np.array(heights)
 
 
 def push(sim, torque_of_step, steps):
@@ -226,8 +226,8 @@ def push(sim, torque_of_step, steps):
     counts = np.ones(sim.num_worlds, dtype=bool)
     on_ground = "ground" in sim.model.shape_label
     for i in range(steps):
-        torque, rate = torque_of_step(i), sim.joint_qd()[:, MOTOR_V]
-        joint_f[:, MOTOR_V] = np.where((np.abs(rate) < no_load) | (rate * torque < 0.0), torque, 0.0)
+        torque, rate = torque_of_step(i), sim.joint_qd()[:, MOTOR_DOFS]
+        joint_f[:, MOTOR_DOFS] = np.where((np.abs(rate) < no_load) | (rate * torque < 0.0), torque, 0.0)
         sim.control.joint_f.assign(joint_f.ravel())
         sim.solver.step(sim.state, sim.state, sim.control, None, sim.dt)
         if on_ground:
@@ -271,7 +271,7 @@ def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
     for _ in range(480):
         sim.physics_step()
         counts &= lowest_corner(sim) > 0.0
-        landed |= counts & (paw_forces(sim)[..., 2] > 0.0).any(axis=1)
+        landed |= counts & (paw_forces(sim)[..., Z] > 0.0).any(axis=1)
         worst = np.maximum(worst, worst_excess(sim, counts)) if counts.any() else worst
     assert landed.sum() > 40
     assert not sim.solver.diverged.numpy().any()

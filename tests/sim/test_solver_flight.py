@@ -8,9 +8,10 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import DOFS, MOTOR_DOFS
 from jumper_warp.robot.model import leg_geometry_array, load_description
 from jumper_warp.sim.dynamics import kernel_modules
-from solver_helpers import DOFS, KNEE_V, MOTOR_V, Flight, Reference, bare_model, paw_joint, random_states
+from solver_helpers import KNEE_V, Flight, Reference, bare_model, paw_joint, random_states
 
 GRAVITY = 9.81
 
@@ -166,7 +167,7 @@ def test_passive_losses_dissipate_expected_power(loss):
     states, model = random_states(n, 7), bare_model(n)
     lossless = Flight(model, double=True).run(states, dt)
     values = np.zeros((n, DOFS), dtype=np.float32)
-    values[:, KNEE_V if loss == "knees" else MOTOR_V] = 0.1 if loss == "knees" else 0.02
+    values[:, KNEE_V if loss == "knees" else MOTOR_DOFS] = 0.1 if loss == "knees" else 0.02
     (model.joint_damping if loss == "knees" else model.joint_friction).assign(values.ravel())
     if loss == "knees":
         model.joint_effort_limit.fill_(1.0)
@@ -183,7 +184,7 @@ def test_passive_losses_dissipate_expected_power(loss):
 def test_damping_and_friction_always_reduce_energy(gentle):
     n = len(gentle.pos)
     model = bare_model(n)
-    for array, dofs, value in ((model.joint_damping, KNEE_V, 0.1), (model.joint_friction, MOTOR_V, 0.02)):
+    for array, dofs, value in ((model.joint_damping, KNEE_V, 0.1), (model.joint_friction, MOTOR_DOFS, 0.02)):
         values = np.zeros((n, DOFS), dtype=np.float32)
         values[:, dofs] = value
         array.assign(values.ravel())

@@ -7,12 +7,13 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
+from columns import COORDS, DOFS, LIN_VEL, MOTOR_DOFS, X, Z
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import NotThisRobotError
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.errors import InputError
 from simulation_helpers import simulation
-from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
+from solver_helpers import BODIES, KNEE_V
 
 DT = 1.0 / 480.0
 
@@ -21,8 +22,8 @@ def launch(sim):
     """Reset all worlds to a start 0.2 m above standing at 1.5 m/s along x: every parameter affects the motion."""
     sim.solver.reset(sim.state)
     q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
-    q[:, 2] += 0.2
-    qd[:, 0] = 1.5
+    q[:, Z] += 0.2
+    qd[:, X] = 1.5
     sim.state.joint_q.assign(q.ravel())
     sim.state.joint_qd.assign(qd.ravel())
 
@@ -113,12 +114,12 @@ CHANGES = [  # array, rows per world, rows to change (None: world 1's shapes), f
     ("body_mass", BODIES, slice(0, 1), 1.3, ModelFlags.BODY_INERTIAL_PROPERTIES),
     ("body_com", BODIES, slice(0, 1), 3.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
     ("body_inertia", BODIES, slice(1, 21), 2.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
-    ("joint_armature", DOFS, MOTOR_V, 3.0, ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES),
-    ("joint_armature", DOFS, MOTOR_V, 3.0, ModelFlags.JOINT_DOF_PROPERTIES),
-    ("joint_friction", DOFS, MOTOR_V, 10.0, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
+    ("joint_armature", DOFS, MOTOR_DOFS, 3.0, ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES),
+    ("joint_armature", DOFS, MOTOR_DOFS, 3.0, ModelFlags.JOINT_DOF_PROPERTIES),
+    ("joint_friction", DOFS, MOTOR_DOFS, 10.0, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
     ("joint_damping", DOFS, KNEE_V, 0.1, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
     ("joint_effort_limit", DOFS, KNEE_V, 0.2, ModelFlags.JOINT_DOF_FORCE_PROPERTIES),
-    ("joint_limit_upper", DOFS, MOTOR_V, 0.6, ModelFlags.JOINT_DOF_PROPERTIES),
+    ("joint_limit_upper", DOFS, MOTOR_DOFS, 0.6, ModelFlags.JOINT_DOF_PROPERTIES),
     ("shape_material_mu", None, None, 0.5, ModelFlags.SHAPE_PROPERTIES),
     ("gravity", 1, slice(0, 1), 0.5, ModelFlags.MODEL_PROPERTIES),
 ]
@@ -162,7 +163,7 @@ def test_each_world_has_its_gravity():
     sim.solver.notify_model_changed(ModelFlags.MODEL_PROPERTIES)
     sim.solver.step(sim.state, sim.state, None, None, DT)
     # all links accelerate equally
-    assert sim.joint_qd()[:, :3] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
+    assert sim.joint_qd()[:, LIN_VEL] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
 
 
 def test_reset_with_flag_none_clears_contact_forces_but_keeps_the_state():
@@ -221,7 +222,7 @@ def test_explicit_torques_match_closed_loop_motors():
         before = driven.joint_q().copy(), driven.joint_qd().copy()
         driven.physics_step()
         joint_f = np.zeros((2, DOFS), dtype=np.float32)
-        joint_f[:, MOTOR_V] = driven.torque.numpy().T
+        joint_f[:, MOTOR_DOFS] = driven.torque.numpy().T
         explicit.control.joint_f.assign(joint_f.ravel())
         explicit.state.joint_q.assign(before[0].ravel())
         explicit.state.joint_qd.assign(before[1].ravel())

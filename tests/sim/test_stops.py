@@ -9,6 +9,7 @@ from newton import ModelFlags
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
+from columns import DOFS, MOTOR_DOFS, Z
 from jumper_warp.kernels import layout
 from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, build_model
 from jumper_warp.robot.motors import vertical_jump_filter
@@ -24,7 +25,7 @@ from simulation_helpers import (
     tilted,
     write_state,
 )
-from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_states
+from solver_helpers import BODIES, Reference, States, random_states
 
 DT = 1.0 / 480.0
 BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])
@@ -138,7 +139,7 @@ class StopSteps:
     def run(self, states, torque=0.0):
         """Return states with the velocities after a step and the poses before it; torque: [N m], scalar or (n, 12)."""
         joint_f = np.zeros((self.n, DOFS))
-        joint_f[:, MOTOR_V] = torque
+        joint_f[:, MOTOR_DOFS] = torque
         q, qd, force = (wp.array(v, dtype=wp.float64) for v in (states.joint_q(), states.joint_qd(), joint_f.ravel()))
         self.dynamics.work.impulse.zero_()
         drive = self.dynamics.drive(force, wp.zeros(self.n * BODIES, dtype=wp.spatial_vector))
@@ -166,7 +167,7 @@ def test_stops_solve_a_quadratic_program():
     """
     n = 40
     states = at_the_stops(n, 21)
-    states.pos[:, 2] = 3.0
+    states.pos[:, Z] = 3.0
     stopping = StopSteps(n, stops=True)
     found, (lower, upper) = stopping.run(states).rates, stopping.bounds()
     units = np.tile(np.vstack([np.zeros(12), np.eye(12)]), (n, 1))
@@ -193,16 +194,16 @@ def test_stops_add_no_energy(falling):
     """One step with stops leaves no more kinetic and stop-spring energy than one without stops and contact."""
     n = 64
     states = at_the_stops(n, 22, joint_rate=15.0)
-    states.pos[:, 2] = 3.0
+    states.pos[:, Z] = 3.0
     if falling:  # at 3 m/s, base level, the lowest paw 0.1 mm above the ground
         states.quat[:] = [0.0, 0.0, 0.0, 1.0]
         states.com_vel += [0.0, 0.0, -3.0]
         sim = simulation(n)
         write_state(sim, states.joint_q().reshape(n, -1))
-        states.pos[:, 2] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., 2].min(axis=1)
+        states.pos[:, Z] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., Z].min(axis=1)
     stopping = StopSteps(n, stops=True)
     ended = stopping.run(states)
-    states.pos[:, 2] += 3.0
+    states.pos[:, Z] += 3.0
     freely = StopSteps(n, stops=False).run(states)
     freely.pos[:] = ended.pos
     reference = Reference(stopping.model)
@@ -215,7 +216,7 @@ def test_stops_add_no_energy(falling):
 
     held = spring(states.angles + DT * ended.rates) - spring(states.angles)
     gained = np.array([reference.energy(ended, i) - reference.energy(freely, i) for i in range(n)]) + held
-    landed = stopping.dynamics.work.impulse.numpy()[..., 2].max(axis=0) > 0.0
+    landed = stopping.dynamics.work.impulse.numpy()[..., Z].max(axis=0) > 0.0
     assert landed.mean() > 0.8 if falling else not landed.any()
     assert gained.max() < 1.0e-6  # [J]
     assert np.median(gained) < -0.1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from columns import MOTOR_COORDS, MOTOR_DOFS
 from jumper_warp.kernels.layout import LEG_ROWS, MU_DYNAMIC, MU_STATIC, UPPER
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
@@ -14,8 +15,7 @@ from jumper_warp.sim.tape import DifferentiableStep
 from tests.helpers.rollout_helpers import squat
 
 N, STEPS, DT = 4, 3, 1.0 / 960.0  # worlds, steps, [s]
-COORDS = [*range(7), *(7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
-DOFS = [*range(6), *(6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]  # base and motors in joint_qd
+COORDS, DOFS = [*range(7), *MOTOR_COORDS], [*range(6), *MOTOR_DOFS]  # base and motors in joint_q and joint_qd
 
 
 class TapeSteps:
@@ -23,7 +23,7 @@ class TapeSteps:
 
     def __init__(self):
         self.dynamics = JumperDynamics(build_model(N, visuals=False, requires_grad=True, device="cpu"), double=True)
-        self.stepper = DifferentiableStep(self.dynamics, 200, 1.0e-13)
+        self.stepper = DifferentiableStep(self.dynamics, 200, 1.0e-13)  # iterations, tolerance [m/s]
         rng = np.random.default_rng(0)
         start, rates = squat()
         q, qd, force = np.zeros((N, 43)), np.zeros((N, 38)), np.zeros((STEPS, N, 38))
@@ -32,7 +32,7 @@ class TapeSteps:
         force[:, :, DOFS] = 3.0 * rng.normal(size=(STEPS, N, 18))
         table = self.dynamics.robot.table.numpy().copy()
         for leg in range(4):
-            table[[leg * int(LEG_ROWS) + int(row) for row in (MU_DYNAMIC, MU_STATIC)], 1] = 0.25
+            table[[leg * int(LEG_ROWS) + int(row) for row in (MU_DYNAMIC, MU_STATIC)], 1] = 0.25  # friction of world 1
             table[leg * int(LEG_ROWS) + int(UPPER) + 1, 2] = math.radians(85.0) - 1.0e-3  # world 2 presses outer stops
         self.values = {"q": q, "qd": qd, "joint_f": force, "table": table}
         self.values["body_f"] = rng.integers(-256, 257, (STEPS, N * 21, 6)) / 128.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from columns import ANG_VEL, LIN_VEL, POS, QUAT
 from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
@@ -18,9 +19,10 @@ from velocity_helpers import edit, states_of, walking_env
 
 HALF = 8  # worlds
 BODIES = 21
-SWAPPED_JOINTS = [5 * leg + j for leg in LEGS for j in range(5)]  # of the 20 hinges
+SWAPPED_COORDS = [7 + 5 * leg + j for leg in LEGS for j in range(5)]  # of the 20 hinges
+SWAPPED_DOFS = [column - 1 for column in SWAPPED_COORDS]
 FLIP, SPIN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # signs of vectors and of rotation vectors
-QUAT = np.array([-1.0, 1.0, -1.0, 1.0])  # signs of xyzw
+QUAT_SIGNS = np.array([-1.0, 1.0, -1.0, 1.0])  # of xyzw
 
 
 def task():
@@ -35,7 +37,7 @@ def task():
 
 
 def with_mirrored_half(values, mirror):
-    """Return a copy of values (2 * HALF, ...) whose second half is mirror(first half)."""
+    """Return a copy of values (2 * HALF worlds, ...) whose second half is mirror(first half)."""
     values = values.copy()
     values[HALF:] = mirror(values[:HALF])
     return values
@@ -63,12 +65,12 @@ def reflection():
     mirror_array(
         robot.joint_q,
         (n, 43),
-        lambda q: np.concatenate([q[:, :3] * FLIP, q[:, 3:7] * QUAT, q[:, 7:27][:, SWAPPED_JOINTS], q[:, 27:]], axis=1),
+        lambda q: np.concatenate([q[:, POS] * FLIP, q[:, QUAT] * QUAT_SIGNS, q[:, SWAPPED_COORDS], q[:, 27:]], axis=1),
     )
     mirror_array(
         robot.joint_qd,
         (n, 38),
-        lambda v: np.concatenate([v[:, :3] * FLIP, v[:, 3:6] * SPIN, v[:, 6:26][:, SWAPPED_JOINTS], v[:, 26:]], axis=1),
+        lambda v: np.concatenate([v[:, LIN_VEL] * FLIP, v[:, ANG_VEL] * SPIN, v[:, SWAPPED_DOFS], v[:, 26:]], axis=1),
     )
     robot.body_f.assign(np.random.default_rng(1).normal(size=(n * BODIES, 6)))
     mirror_array(robot.body_f, (n, BODIES, 6), lambda f: f * np.concatenate([FLIP, SPIN]))
@@ -114,6 +116,7 @@ def test_observation_of_a_mirrored_robot_is_the_mirror_image(reflection, group):
 
 
 def test_mirroring_twice_is_the_identity():
+    """A mirror image is x -> signs * x[order], of observations and of actions."""
     for mirror in (mirror_of(task(), "actor"), mirror_of(task(), "critic"), mirror_of_action()):
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]

@@ -15,6 +15,7 @@ from jumper_warp.tasks.terms import Advance, ObservationTerm, RewardTerm, Termin
 from jumper_warp.utils.errors import InputError
 
 
+# Functions of terms, each named for the type that it returns, whose annotation is right, absent or float.
 @wp.func
 def whole(robot: RobotView, state: Any) -> int:
     return 1

@@ -1,6 +1,7 @@
 """Trajectory optimisation: knots, terms of jumps against the simulation, and descents with known minima."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.trajectory import jumps
 from jumper_warp.trajectory.augmented_lagrangian import minimise
-from jumper_warp.trajectory.problem import Knots, Problem, Values
+from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Values
 from jumper_warp.trajectory.smoothing import SHIFT, Stage, crossed, descend, smoothed
 from jumper_warp.utils.errors import InputError
 
@@ -28,13 +29,21 @@ def problem(objective=None, constraints=(), **settings) -> Problem:
     return Problem(KNOTS, objective or jumps.highest(), constraints, jumping_motors(18.0), **settings)
 
 
+class Jump(NamedTuple):
+    """A jump from standing by a squat and a push-off."""
+
+    problem: Problem
+    x: torch.Tensor  # (1, 20) candidate: `SQUAT_AND_PUSH`
+    motion: SimulatedMotion  # of x, without gradients
+
+
 @pytest.fixture(scope="module")
 def jump():
-    """Return a problem, the candidate x (1, 20) of `SQUAT_AND_PUSH`, and its motion without gradients."""
+    """Return the `Jump`."""
     jump_problem = problem()
     x = torch.as_tensor(SQUAT_AND_PUSH.reshape(1, -1))
     with torch.no_grad():
-        return jump_problem, x, jump_problem.motion(x)
+        return Jump(jump_problem, x, jump_problem.motion(x))
 
 
 # ---------------------------------------------------------------- knots
@@ -174,14 +183,17 @@ class Bowl:
         self.device = "cpu"
 
     def rollout(self, _):
+        """Return what has `world_steps` and `reverse_steps`."""
         return self
 
     def evaluate(self, x):
-        offset = x - self.goal
+        """Return the `Values` of candidates x (n, 2): objective (n,) and constraint (n, 1), met where it is <= 0."""
+        (a, b), (a_goal, b_goal) = x.T, self.goal
         self.world_steps += len(x)
-        return Values(offset[:, 0] ** 2 + 20.0 * offset[:, 1] ** 2, (x.sum(1) - 0.5)[:, None])
+        return Values((a - a_goal) ** 2 + 20.0 * (b - b_goal) ** 2, (a + b - 0.5)[:, None])
 
     def gradient(self, x, merit):
+        """Return the `Values` of candidates x (n, 2), and the gradient (n, 2) of merit(values), (n,)."""
         x = x.detach().requires_grad_()
         values = self.evaluate(x)
         self.reverse_steps += len(x)
@@ -202,6 +214,7 @@ def test_descent_finds_the_constrained_minimum_reproducibly():
 
 
 def test_descent_stays_in_the_box():
+    """The minimum without bounds is at a = 3; actions lie in -1 to 1."""
     bowl = Bowl()
     bowl.goal = torch.tensor([3.0, -0.2], dtype=torch.float64)
     bowl.evaluate = lambda x: Values((x - bowl.goal).square().sum(1), x.new_zeros(len(x), 0))
@@ -222,14 +235,15 @@ def test_smoothed_descent_approaches_the_minimum():
 def test_multipliers_enforce_constraints_of_smoothed_descent():
     begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
     violation = {}
-    for dual in (0.0, 0.5):  # 0: penalty alone
+    for dual in (0.0, 0.5):  # rate of the multipliers; 0: penalty alone
         stage = Stage(keep=1, iterations=300, rate=0.02, noise=0.02, penalty=1.0, dual=dual)
         violation[dual] = float(descend(Bowl(), begin, stage, np.random.default_rng(0)).sum() - 0.5)
     assert violation[0.0] > 0.1 and abs(violation[0.5]) < 0.02
 
 
 def test_stage_with_slack_ends_at_best_feasible_points():
-    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
+    """With a slack, a start ends at its best point that nearly meets the constraints, not at its last point."""
+    begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)  # a + b = 0.8 violates the constraint
     stage = Stage(keep=1, iterations=300, rate=0.02, noise=0.02, penalty=1.0, dual=0.5, slack=0.5)
     result = descend(Bowl(), begin, stage, np.random.default_rng(0))
     assert float(result.sum() - 0.5) < 5e-3  # violation
@@ -240,6 +254,7 @@ class Edge(Bowl):
     """`Bowl` with an objective of 5 where a > 0.45, and a constraint that is never active."""
 
     def evaluate(self, x):
+        """As `Bowl.evaluate`."""
         values = super().evaluate(x)
         return Values(torch.where(x[:, 0] > 0.45, 5.0, values.objective), values.constraints - 1.0)
 
@@ -281,7 +296,7 @@ def test_crossings_join_a_beginning_with_another_end():
 
 def test_smoothed_search_uses_crossings():
     """The minimum, 0 at both knots, is the beginning of one start with the end of the other."""
-    begin = np.array([[0.0] * 4 + [0.9] * 4, [0.9] * 4 + [0.0] * 4])
+    begin = np.array([[0.0] * 4 + [0.9] * 4, [0.9] * 4 + [0.0] * 4])  # (2 starts, 2 knots of 4 actions)
     bowl = Bowl()
     bowl.evaluate = lambda x: Values(x.square().sum(1), x.new_zeros(len(x), 0))
     bowl.knots = Knots((0.0, 1.0), steps=2)
@@ -290,6 +305,7 @@ def test_smoothed_search_uses_crossings():
 
 
 def test_descent_raises_a_jump_within_its_constraints():
+    """The objective is minus the apex height [m]; the result meets the constraints and has the reported objective."""
     jump_problem = problem(constraints=(jumps.clear(), jumps.upright(math.radians(10.0))))
     begin = SQUAT_AND_PUSH.reshape(1, -1)
     with torch.no_grad():

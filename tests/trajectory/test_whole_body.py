@@ -1,11 +1,15 @@
 """Kinematics, momentum and clearance against the simulation's kernels."""
 
+from typing import NamedTuple
+
+import newton
 import numpy as np
 import pytest
 import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, POS, QUAT, Z
 from jumper_warp.diff.rollout import Rollout, compact
 from jumper_warp.kernels.collision import robot as collision
 from jumper_warp.kernels.layout import COORDS
@@ -14,29 +18,36 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.trajectory.whole_body import WholeBody
 
 N = 6  # worlds
-MOTORS = [5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]  # lateral, outer, inner of Newton's leg joints
+
+
+class Links(NamedTuple):
+    """N robots in random states, and the world poses and twists of their 21 links by the simulation's kernels."""
+
+    model: newton.Model
+    body: WholeBody
+    q: torch.Tensor  # (N, 19) base pose and motor angles
+    qd: torch.Tensor  # (N, 18)
+    pose: np.ndarray  # (N, 21, 7) position [m], quaternion xyzw
+    twist: np.ndarray  # (N, 21, 6) velocity of the com [m/s], angular velocity [rad/s]
 
 
 @pytest.fixture(scope="module")
 def links():
-    """Return model, `WholeBody`, random q (N, 19) and qd (N, 18), and the kernels' poses (N, 21, 7), twists (N, 21, 6).
-
-    Poses: position [m] and quaternion xyzw of links; twists: COM velocity [m/s], angular velocity [rad/s]; world frame.
-    """
+    """Return the `Links`."""
     rng, model = np.random.default_rng(0), build_model(N, visuals=False)
     joint_q, joint_qd = np.zeros((N, 43)), np.zeros((N, 38))
     angles = rng.uniform(0.2, 1.5, (N, 4, 3)) * [0.2, 1.0, 1.0]
-    joint_q[:, :3] = [0.0, 0.0, 1.0] + rng.normal(size=(N, 3))
-    joint_q[:, 3:7] = Rotation.random(N, random_state=rng).as_quat()
-    joint_q[:, 7:][:, MOTORS] = angles.reshape(N, 12)
-    joint_qd[:, :6], joint_qd[:, 6:][:, MOTORS] = rng.normal(size=(N, 6)), 4.0 * rng.normal(size=(N, 12))
+    joint_q[:, POS] = [0.0, 0.0, 1.0] + rng.normal(size=(N, 3))
+    joint_q[:, QUAT] = Rotation.random(N, random_state=rng).as_quat()
+    joint_q[:, MOTOR_COORDS] = angles.reshape(N, 12)
+    joint_qd[:, :6], joint_qd[:, MOTOR_DOFS] = rng.normal(size=(N, 6)), 4.0 * rng.normal(size=(N, 12))
     state = model.state()
     state.joint_q.assign(joint_q.ravel().astype(np.float32))
     state.joint_qd.assign(joint_qd.ravel().astype(np.float32))
     JumperDynamics(model).full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
     pose, twist = state.body_q.numpy().reshape(N, 21, 7), state.body_qd.numpy().reshape(N, 21, 6)
     q, qd = (torch.as_tensor(rows.T) for rows in compact(joint_q, joint_qd, N))
-    return model, WholeBody(Rollout(model, double=True)), q, qd, pose, twist
+    return Links(model, WholeBody(Rollout(model, double=True)), q, qd, pose, twist)
 
 
 def test_link_poses_match_the_kernels(links):
@@ -57,17 +68,19 @@ def test_momentum_and_base_velocity_match_link_twists(links):
     """The oracle sums mass, momentum and inertia over the model's 21 links."""
     model, body, q, qd, pose, twist = links
     mass = model.body_mass.numpy().reshape(N, 21, 1).astype(float)
-    rotation = Rotation.from_quat(pose[..., 3:].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
-    center = pose[..., :3] + (rotation @ model.body_com.numpy().reshape(N, 21, 3, 1))[..., 0]
-    com, vel = ((mass * x).sum(1) / mass.sum(1) for x in (center, twist[..., :3]))
+    rotation = Rotation.from_quat(pose[..., QUAT].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
+    lin_vel, ang_vel = twist[..., LIN_VEL], twist[..., ANG_VEL]
+    center = pose[..., POS] + (rotation @ model.body_com.numpy().reshape(N, 21, 3, 1))[..., 0]
+    com, vel = ((mass * x).sum(1) / mass.sum(1) for x in (center, lin_vel))  # of the robot
     inertia = rotation @ model.body_inertia.numpy().reshape(N, 21, 3, 3) @ rotation.swapaxes(-1, -2)
-    arm, moving = center - com[:, None], twist[..., :3] - vel[:, None]
-    spin = ((inertia @ twist[..., 3:, None])[..., 0] + mass * np.cross(arm, moving)).sum(1)
+    arm, moving = center - com[:, None], lin_vel - vel[:, None]  # relative to the robot's com
+    spin = ((inertia @ ang_vel[..., None])[..., 0] + mass * np.cross(arm, moving)).sum(1)
     square = (arm**2).sum(-1)[..., None, None] * np.eye(3) - arm[..., None] * arm[..., None, :]
     whole = (inertia + mass[..., None] * square).sum(1)
     for value, expected in zip(body.momentum(q, qd), (com, vel, spin, whole), strict=True):
         assert value.numpy() == pytest.approx(expected, abs=1e-5)  # [m], [m/s], [kg m^2/s], [kg m^2]
-    origin_velocity = twist[:, 0, :3] - np.cross(twist[:, 0, 3:], rotation[:, 0] @ model.body_com.numpy()[0])
+    base = 0  # link
+    origin_velocity = lin_vel[:, base] - np.cross(ang_vel[:, base], rotation[:, base] @ model.body_com.numpy()[base])
     assert body.base_velocity(q, qd).numpy() == pytest.approx(origin_velocity, abs=1e-5)  # [m/s]
 
 
@@ -80,9 +93,9 @@ def test_clearance_matches_collision_kernel(links):
     for kind, flag in enumerate(flags):
         for depth, touches in ((-0.001, False), (0.001, True)):  # [m] below the ground
             joint_q = np.zeros((N, int(COORDS)), dtype=np.float32)
-            joint_q[:, :7] = q[:, :7].numpy()
-            joint_q[:, 2] -= gaps[:, kind] + depth
-            joint_q[:, 7:][:, MOTORS] = q[:, 7:].numpy()
+            joint_q[:, :7] = q[:, :7].numpy()  # base pose
+            joint_q[:, Z] -= gaps[:, kind] + depth
+            joint_q[:, MOTOR_COORDS] = q[:, 7:].numpy()
             flags_out, distance = wp.zeros(N, dtype=int), wp.zeros(N, dtype=float)
             wp.launch(
                 collision.collision_kernel, dim=N,

@@ -25,6 +25,7 @@ def module(tmp_path, monkeypatch):
 
 
 def executed(module):
+    """Return whether the module's code has run, without running it."""
     return "VALUE" in vars(module)
 
 

@@ -22,6 +22,7 @@ PAPER = {"goal_reached_rate": 0.91, "apex_error_abs_mean_m": 0.04}
 def summary(tmp_path, capsys):
     """Function that prints the summary of METRICS in a folder with some files, and returns its text and the folder."""
 
+    # keys: metrics to print; files: empty files in the folder; flags: of `PrintFlags`
     def run(keys=tuple(METRICS)[:5], files=("a.png", "film.mp4", "jump.rrd", "notes.txt"), **flags):
         write_metrics(tmp_path, METRICS, {"solver": "jumper"})
         for name in files:

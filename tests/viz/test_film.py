@@ -11,6 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from box_robot import RATE, STANDING, box_recording, colored, pinhole, walk
+from columns import POS
 from jumper_warp.evaluation.commands import FilmCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import film
@@ -30,6 +31,7 @@ class Canvas:
         self.shapes, self.size, self.poses, self.views, self.lines = shapes, size, [], [], []
 
     def draw(self, poses, view, lines=()):
+        """Store the arguments; return an image (height, width, 3) of one grey level that counts the images."""
         self.poses.append(poses), self.views.append(view), self.lines.append(lines)
         return np.full((self.size[1], self.size[0], 3), len(self.views) % 120 * 2, np.uint8)
 
@@ -110,7 +112,7 @@ def test_robots_stay_in_view_of_the_default_camera(tmp_path, canvas):
     write_film(box_recording(places, spacing=1.0), tmp_path / "two.webp", size=SIZE, fps=15.0)
     (drawn,) = canvas
     for view, poses in zip(drawn.views, drawn.poses, strict=True):
-        pixels = pinhole(poses[:, :3], view.eye, view.target, view.field_of_view, SIZE)
+        pixels = pinhole(poses[:, POS], view.eye, view.target, view.field_of_view, SIZE)
         assert (pixels > 0.0).all() and (pixels < SIZE).all()
     assert drawn.poses[0][1, 1] - drawn.poses[0][0, 1] == pytest.approx(1.0)  # [m] apart
 
@@ -175,7 +177,7 @@ def test_interpolated_poses_are_unit_quaternions_halfway_and_exact_at_recorded_t
     recording.poses[:4, 0, 3:] = Rotation.from_rotvec(angles[:, None] * [0.0, 1.0, 0.0], degrees=True).as_quat()
     recording.poses[2, 0, 3:] *= -1.0  # the same rotation
     exact = drawn_poses(recording, recording.times)
-    assert exact[..., :3] == pytest.approx(recording.poses[..., :3].astype(float), abs=1e-6)
+    assert exact[..., :3] == pytest.approx(recording.poses[..., POS].astype(float), abs=1e-6)
     signs = (exact[..., 3:] * recording.poses[..., 3:]).sum(axis=-1)
     assert np.abs(signs) == pytest.approx(1.0, abs=1e-6)  # equal up to sign, thus the same rotation
     between = drawn_poses(recording, recording.times[:3] + 0.5 / RATE)

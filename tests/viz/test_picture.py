@@ -8,6 +8,7 @@ from PIL import Image
 from scipy import ndimage
 
 from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
+from columns import XY, X, Z
 from jumper_warp.evaluation.recorder import save_recording
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import picture
@@ -47,8 +48,8 @@ def test_jump_in_place_is_shown_from_squat_to_rest_and_spread():
     assert list(scene.frames[[0, 1, 3, 5, 6]]) == [SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST]
     assert TAKEOFF < scene.frames[2] < APEX < scene.frames[4] < TOUCHDOWN
     assert scene.flights == [(TAKEOFF, TOUCHDOWN)]
-    assert np.diff(scene.bases[:, 0]) == pytest.approx(SPREAD) and scene.shift.mean() == pytest.approx(0.0)
-    assert scene.bases[:, 2] == pytest.approx(jump()[0][scene.frames, 2], abs=1e-6)
+    assert np.diff(scene.bases[:, X]) == pytest.approx(SPREAD) and scene.shift.mean() == pytest.approx(0.0)
+    assert scene.bases[:, Z] == pytest.approx(jump()[0][scene.frames, 2], abs=1e-6)
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0])
@@ -89,15 +90,15 @@ def test_hops_in_place_show_the_first_two_over_time_without_their_path(drift):
     positions, forces = jump(drift)
     hops = np.concatenate([positions + [drift * i, 0.0, 0.0] for i in range(8)])
     scene = compose(box_recording(hops, forces=np.tile(forces, 8)))
-    second = REST + 1
+    second = REST + 1  # first frame of the second hop
     assert set(scene.frames) >= {TAKEOFF, APEX, TOUCHDOWN, *(second + TAKEOFF, second + APEX, second + TOUCHDOWN)}
     assert len(scene.frames) == MOST and scene.frames[-1] == second + TOUCHDOWN
     assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
     axis, *_ = (line.points for line in picture._lines(scene))
-    assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, 2] == pytest.approx(scene.lowest)
+    assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, Z] == pytest.approx(scene.lowest)
     times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
     assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
-    assert all(label.point[2] < scene.lowest for label in times)
+    assert all(label.point[Z] < scene.lowest for label in times)
 
 
 def test_lifted_paws_without_rise_are_no_jump():
@@ -109,7 +110,7 @@ def test_lifted_paws_without_rise_are_no_jump():
 @pytest.mark.parametrize(("distance", "moments"), [(0.7, 2), (2.5, 4), (4.0, 6), (9.0, MOST)])
 def test_moments_of_a_walk_are_side_by_side(distance, moments):
     scene = compose(box_recording(walk(distance, 5.0)))
-    gaps = np.diff(scene.bases[:, 0])
+    gaps = np.diff(scene.bases[:, X])
     assert len(scene.frames) == moments and not scene.shift.any()
     assert gaps.min() >= min(SIDE_BY_SIDE, 0.95 * distance) - 0.05 and gaps.max() < 1.1 * gaps.min()
 
@@ -154,7 +155,7 @@ def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_pat
     ((shapes, size, poses, view),) = drawn
     assert poses[:, 0, :3] == pytest.approx(positions[compose(recording, 1).frames], abs=1e-6)
     (ring,) = (shape for shape in shapes if shape.name.startswith("goal"))
-    assert ring.vertices[:, :2].mean(axis=0) == pytest.approx([1.5, 0.1], abs=1e-5)
+    assert ring.vertices[:, XY].mean(axis=0) == pytest.approx([1.5, 0.1], abs=1e-5)
     assert sum(shape.color == GREEN for shape in shapes) == 1  # the other world's robot is not drawn
     pixels = pinhole(np.concatenate([poses[:, 0, :3], goals[1]]), view.eye, view.target, view.field_of_view, size)
     assert (pixels > 0.0).all() and (pixels < size).all()

@@ -21,15 +21,17 @@ def drawn(monkeypatch, tmp_path):
     return draw
 
 
-def sweep(drawn, reached, good):
-    commanded = np.linspace(0.5, 1.2, len(reached))
+def sweep(drawn, error, good):
+    """Return the axes of a sweep of heights commanded from 0.5 to 1.2 m; error [m] (n,), good: (n,) of bool."""
+    commanded = np.linspace(0.5, 1.2, len(error))
     return drawn(
-        plots.plot_sweep, commanded, commanded + reached, good, tolerance=0.1, marks=("reached", "missed"), title="",
+        plots.plot_sweep, commanded, commanded + error, good, tolerance=0.1, marks=("reached", "missed"), title="",
         paper=plots.Published(0.04, ((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), 1.075), labels=("x", "y"), conditions="",
     )  # fmt: skip
 
 
 def line(axis, label):
+    """Return the line of an axis with a label."""
     return next(line for line in axis.lines if line.get_label() == label)
 
 
@@ -38,7 +40,8 @@ def test_sweep_has_equal_axes_and_errors_below(drawn):
     top, bottom = sweep(drawn, error, error > -0.1)
     assert top.get_aspect() == 1.0 and bottom.get_ylabel() == "error [m]"
     np.testing.assert_allclose(line(bottom, "reached").get_ydata(), error[error > -0.1], atol=1e-12)
-    np.testing.assert_allclose(line(top, "reached").get_ydata(), (np.linspace(0.5, 1.2, 30) + error)[error > -0.1])
+    reached = np.linspace(0.5, 1.2, 30) + error  # [m]
+    np.testing.assert_allclose(line(top, "reached").get_ydata(), reached[error > -0.1])
 
 
 def test_sweep_marks_the_values_of_the_paper(drawn):
@@ -67,7 +70,7 @@ def test_interval_of_running_mean_has_the_width_of_the_standard_error():
 
 
 def test_landings_show_outline_of_a_platform_and_failures(drawn):
-    goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])
+    goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])  # [m]; the second jump fails
     corners = np.array([[(-1.0, -1.0), (0.4, -1.0), (0.4, 1.0), (-1.0, 1.0)]])
     (axis,) = drawn(
         plots.plot_landings, {"platform": (goals, goals + 0.2, good)}, tolerance=0.1, title="", conditions="",
@@ -76,7 +79,7 @@ def test_landings_show_outline_of_a_platform_and_failures(drawn):
     assert axis.get_title(loc="left") == "platform, 0.15 m high" and axis.get_aspect() == 1.0
     np.testing.assert_allclose(axis.collections[0].get_paths()[0].vertices[:4], corners[0])
     failed = next(marks for marks in axis.collections if marks.get_label() == "failed")
-    np.testing.assert_allclose(failed.get_offsets(), [(1.4, 0.3)])
+    np.testing.assert_allclose(failed.get_offsets(), [(1.4, 0.3)])  # its landing, 0.2 m off along x and y
 
 
 def test_legend_is_below_the_axes_and_names_labels_once(drawn):

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from rerun.chunk import RrdReader
 
+from columns import X, Z
 from jumper_warp.robot.model import build_model
 from jumper_warp.viz.recorder import Recorder
 from jumper_warp.viz.recording import Recording, RecordingError, load_npz
@@ -40,8 +41,8 @@ def frame_poses(frame):
     """Return distinct poses of the four bodies, (4, 7): [m], xyzw; turned about z by 0.1 rad by frame and body."""
     angle = 0.05 * (frame + np.arange(4))
     poses = np.zeros((4, 7))
-    poses[:, 0] = np.arange(4)
-    poses[:, 2] = 0.1 * frame
+    poses[:, X] = np.arange(4)  # [m]
+    poses[:, Z] = 0.1 * frame
     poses[:, 5], poses[:, 6] = np.sin(angle), np.cos(angle)
     return poses
 
@@ -185,7 +186,7 @@ def test_rrd_of_a_loaded_recording_is_the_only_new_file_and_has_a_view_of_each_g
 
 def test_rrd_plays_from_the_start_and_its_eye_follows_the_worlds(model, tmp_path):
     path = record(model, worlds=(0, 1), spacing=1.5).save_rrd(tmp_path / "run.rrd")
-    layout, target = blueprint(path), rows(path)["/scene/view_target"]
+    layout, target = blueprint(path), rows(path)["/scene/view_target"]  # the entity that the eye looks at and follows
     assert layout["TimePanelBlueprint:play_state"] == [[2]]  # playing; 3 would follow the end
     assert layout["EyeControls3D:tracking_entity"] == [["/scene/view_target"]]
     positions = [value[0] for _, value in sorted(target["Transform3D:translation"])]

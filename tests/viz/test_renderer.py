@@ -97,6 +97,7 @@ def test_renderers_draw_in_turn_while_others_open_and_close(kind):
 
 
 def test_windows_are_used_again(opengl):
+    """A closed renderer's window, closed once or twice, goes to the next renderer and to no other."""
     renderer = GLRenderer([BALL], 1, SIZE)
     window = renderer._viewer
     renderer.close()

@@ -25,11 +25,13 @@ def build(add=lambda builder, body: None, add_ground=lambda scene: None):
     return shapes.shape_meshes(scene.finalize(device="cpu"), (0,))
 
 
-def extent(mesh):  # (3,) [m] along x, y, z
+def extent(mesh):
+    """Return the size of a mesh along x, y, z [m], (3,)."""
     return mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
 
 
-def volume(mesh):  # [m^3]
+def volume(mesh):
+    """Return the volume of a closed mesh [m^3]."""
     return trimesh.Trimesh(mesh.vertices, mesh.triangles).volume
 
 
@@ -94,7 +96,7 @@ def test_heightfield_has_its_heights_at_its_nodes_facing_up():
 
 
 def test_hidden_shapes_and_other_worlds_are_left_out():
-    def add(builder, body):
+    def add(builder, body):  # a visible and a hidden box
         builder.add_shape_box(body, label="seen")
         builder.add_shape_box(body, label="hidden", cfg=newton.ModelBuilder.ShapeConfig(is_visible=False))
 

@@ -7,6 +7,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
+from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS
 from jumper_warp.kernels.actuation import command_filter
 from jumper_warp.kernels.actuation.command_filter import FilterParams, filter_leg
 from jumper_warp.kernels.actuation.motors import MotorArrays, load_motor, motor_torque
@@ -28,9 +29,6 @@ filter64 = importlib.import_module("jumper_warp.kernels_float64.actuation.comman
 
 JUMP = filter_params(vertical_jump_filter())
 WALK = filter_params(walking_filter())
-COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
-MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]  # indices of the 12 motors in a world's joint_q
-MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]  # and in its joint_qd
 
 
 def safe_leg(target, pos, vel=(0.0, 0.0, 0.0), params=JUMP):
@@ -138,9 +136,10 @@ def test_sum_limit_corrects_both_transversal_commands_equally_and_binds_outside(
 
 @given(raw=angle, pos=st.floats(-200.0, 200.0, width=32), vel=speed)
 def test_lateral_command_is_clamped_outside_and_toward_a_limit_and_never_pushed_outward(raw, pos, vel):
+    """Lateral limits of JUMP are -15 and 15 deg; their hard zones reach from the limits to -5 and 0 deg."""
     outside = not -15.0 - ROUNDING <= pos <= 15.0 + ROUNDING
-    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)  # hard zones: above 15 - 15, below -15 + 10
-    safe = safe_leg((raw, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0))[0]
+    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)
+    safe, _, _ = safe_leg((raw, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0))
     if outside or toward:
         assert -15.001 <= safe <= 15.001
     assert min(raw, -15.0) - 1e-3 <= safe <= max(raw, 15.0) + 1e-3

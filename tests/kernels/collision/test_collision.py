@@ -7,6 +7,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coal_shapes import box, capsule, coal_distance
+from columns import POS, QUAT, Z
 from jumper_warp.kernels.collision import robot as collision_module
 from jumper_warp.kernels.kinematics import geometry as geometry_module
 from jumper_warp.kernels.kinematics.geometry import LegGeometry
@@ -56,7 +57,7 @@ def joint_coordinates(pos, quat_xyzw, motors):
     """Return Newton's joint_q, (n, 43), for motor angles [rad] (n, 12); knees and loop joints, not read, are NaN."""
     motors = np.atleast_2d(motors)
     joint_q = np.full((len(motors), 43), np.nan, np.float32)
-    joint_q[:, :3], joint_q[:, 3:7] = pos, quat_xyzw
+    joint_q[:, POS], joint_q[:, QUAT] = pos, quat_xyzw
     for leg in range(4):
         joint_q[:, 7 + 5 * leg + np.array([0, 1, 3])] = motors[:, 3 * leg : 3 * leg + 3]
     return joint_q
@@ -160,16 +161,18 @@ def leg_points(leg, lateral, outer, inner):
 
 def links(points):
     """Return coal capsules of outer thigh, inner thigh, outer shank, inner shank and paw; points: `leg_points`."""
-    radii = (THIGH, THIGH, SHANK, SHANK)
-    bars = [capsule(points[k], points[min(k + 2, 4)], radius) for k, radius in enumerate(radii)]
-    return [*bars, capsule(points[4], points[4], PAW)]
+    outer_axis, inner_axis, outer_knee, inner_knee, ankle = points
+    thighs = [capsule(outer_axis, outer_knee, THIGH), capsule(inner_axis, inner_knee, THIGH)]
+    return [*thighs, *(capsule(knee, ankle, SHANK) for knee in (outer_knee, inner_knee)), capsule(ankle, ankle, PAW)]
 
 
 def self_distance(points):
     """Return coal's smallest distance [m] between the links of a leg, shanks by their upper halves."""
-    bars = links(points)
-    upper = [capsule(points[k], (points[k] + points[4]) / 2, SHANK) for k in (2, 3)]
-    return min(coal_distance(*pair) for pair in ((bars[0], bars[1]), (bars[0], bars[3]), (bars[1], bars[2]), upper))
+    _, _, *knees, ankle = points
+    outer_thigh, inner_thigh, outer_shank, inner_shank, _ = links(points)
+    upper = [capsule(knee, (knee + ankle) / 2, SHANK) for knee in knees]
+    pairs = ((outer_thigh, inner_thigh), (outer_thigh, inner_shank), (inner_thigh, outer_shank), upper)
+    return min(coal_distance(*pair) for pair in pairs)
 
 
 def ground_oracle(pos, quat_xyzw, points):
@@ -179,8 +182,8 @@ def ground_oracle(pos, quat_xyzw, points):
     """
     turn = Rotation.from_quat(quat_xyzw)
 
-    def height(body_points):
-        return np.min(pos[2] + turn.apply(np.reshape(body_points, (-1, 3)))[:, 2])
+    def height(body_points):  # [m] over z = 0 of the lowest of points in the body frame
+        return np.min(pos[Z] + turn.apply(np.reshape(body_points, (-1, 3)))[:, Z])
 
     corners = [
         np.where(pick, high, low)
@@ -205,14 +208,14 @@ def oracle_distances():
     """Return coal's distances [m] (300, 8) of `random_poses`, in the order of FLAGS."""
     pos, quat_xyzw, motors = random_poses()
     out = []
-    for i in range(len(pos)):
-        points = np.array([leg_points(leg, *motors[i, 3 * leg : 3 * leg + 3]) for leg in range(4)])
+    for robot in range(len(pos)):
+        points = np.array([leg_points(leg, *motors[robot, 3 * leg : 3 * leg + 3]) for leg in range(4)])
         bars = [links(p) for p in points]
-        leg_leg = min(coal_distance(a, b) for i, j in NEIGHBOURS for a in bars[i] for b in bars[j])
+        leg_leg = min(coal_distance(a, b) for leg, other in NEIGHBOURS for a in bars[leg] for b in bars[other])
         shells = [[box(*NOSE), box(*TRUNK), box(*(REAR_DRUMS if front > 0 else FRONT_DRUMS))] for front, _ in LEGS]
         leg_shell = min(coal_distance(a, b) for leg in range(4) for a in bars[leg] for b in shells[leg])
         leg_self = min(self_distance(p) for p in points)
-        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), leg_leg, leg_self, leg_shell))
+        out.append((*ground_oracle(pos[robot], quat_xyzw[robot], points), leg_leg, leg_self, leg_shell))
     return np.array(out)
 
 
@@ -227,12 +230,14 @@ def test_category_distance_agrees_with_coal(category):
 
 @pytest.mark.parametrize("bound", [0.0, 0.01, 0.1])  # [m]
 def test_distances_between_links_with_a_bound_are_the_minimum_of_distance_and_bound(bound):
-    full = category_distances(random_poses())[:, 5:]  # LEG_LEG, LEG_SELF, LEG_SHELL
-    np.testing.assert_allclose(category_distances(random_poses(), bound)[:, 5:], np.minimum(full, bound), atol=1e-6)
+    between_links = slice(FLAGS.index("LEG_LEG"), None)  # LEG_LEG, LEG_SELF, LEG_SHELL
+    full, bounded = (category_distances(random_poses(), each)[:, between_links] for each in (10.0, bound))
+    np.testing.assert_allclose(bounded, np.minimum(full, bound), atol=1e-6)
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.02, 5.0])  # [m]
 def test_flags_and_clearance_agree_with_coal(margin):
+    """A flag is raised where its distance is negative; clearance is the smallest distance, at most the margin."""
     pos, quat_xyzw, motors = random_poses()
     flags, clearance = collide(pos, quat_xyzw, np.degrees(motors), margin)
     expected = oracle_distances()
@@ -243,13 +248,13 @@ def test_flags_and_clearance_agree_with_coal(margin):
     assert raised.any(axis=0).all(), "every flag occurs among the poses"
 
 
-def test_flags_and_clearance_are_equal_in_double_precision():
+def test_clearance_is_equal_in_double_precision():
     float64_kernels()
     module = importlib.import_module("jumper_warp.kernels_float64.collision.robot")
     pos, quat_xyzw, motors = random_poses()
-    single = collide(pos, quat_xyzw, np.degrees(motors))
-    double = collide(pos, quat_xyzw, np.degrees(motors), module=module)
-    np.testing.assert_allclose(single[1], double[1], atol=2e-6)  # [m]
+    _, clearance = collide(pos, quat_xyzw, np.degrees(motors))
+    _, expected = collide(pos, quat_xyzw, np.degrees(motors), module=module)
+    np.testing.assert_allclose(clearance, expected, atol=2e-6)  # [m]
 
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
@@ -284,7 +289,7 @@ def test_flags_by_hand(case):
 
 def test_standing_clearance_by_hand():
     # thigh plane 0.105 + 0.05945, trunk half width 0.112, thigh radius 0.019; the knee adds up to 0.00075 outward
-    clearance = collide((0, 0, 1), LEVEL, STAND)[1]
+    _, clearance = collide((0, 0, 1), LEVEL, STAND)
     assert clearance[0] == pytest.approx(0.105 + 0.05945 - 0.112 - 0.019, abs=5e-4)
 
 
@@ -311,7 +316,7 @@ def test_legs_touch_in_the_jumping_workspace_rarely_and_only_where_one_reaches_f
 # ---- heightfield
 
 
-@pytest.mark.parametrize(("height", "raised"), [(0.34, False), (0.36, True)])
+@pytest.mark.parametrize(("height", "raised"), [(0.34, False), (0.36, True)])  # height of the mesa [m]
 def test_shell_corner_inside_a_mesa_raises_body_ground(height, raised):
     # the shell's bottom stands at 0.397 - 0.049 = 0.348; of it only the left rear drums, x -0.144, y 0.199, overlap
     # the mesa x < -0.13, 0.18 < y < 0.205; the paws stand outside
@@ -330,7 +335,9 @@ def test_slope_agrees_with_level_ground_seen_from_a_tilted_frame():
     tilted = tilt * Rotation.from_quat(quat_xyzw)
     ours = category_distances((tilt.apply(pos), tilted.as_quat(), motors), heights=heights)
     level = category_distances(random_poses())
-    np.testing.assert_allclose(ours[:, 1:5], level[:, 1:5], atol=2e-5)  # [m], HOUSING_GROUND to SHANK_GROUND
+    of_legs = slice(FLAGS.index("HOUSING_GROUND"), FLAGS.index("SHANK_GROUND") + 1)
+    np.testing.assert_allclose(ours[:, of_legs], level[:, of_legs], atol=2e-5)  # [m]
     # the shell is tested at the corners that are lower in the world, so both attitudes must agree on which these are
     same_side = Rotation.from_quat(quat_xyzw).as_matrix()[:, 2, 2] * tilted.as_matrix()[:, 2, 2] > 0
-    np.testing.assert_allclose(ours[same_side, 0], level[same_side, 0], atol=2e-5)
+    body = FLAGS.index("BODY_GROUND")
+    np.testing.assert_allclose(ours[same_side, body], level[same_side, body], atol=2e-5)

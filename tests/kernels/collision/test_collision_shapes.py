@@ -43,21 +43,22 @@ def random_segments(count=4000):
 
 def test_segment_distances_agree_with_coal():
     cases = random_segments()
-    ours = shape_distances(*cases)[0]
-    for distance, start_a, end_a, start_b, end_b in zip(ours, *cases[:4], strict=True):
+    segments, _ = shape_distances(*cases)
+    for distance, start_a, end_a, start_b, end_b in zip(segments, *cases[:4], strict=True):
         expected = coal_distance(capsule(start_a, end_a, 0.01), capsule(start_b, end_b, 0.01)) + 0.02  # less the radii
         assert distance == pytest.approx(expected, abs=1e-5)
 
 
 def test_box_distances_agree_with_coal():
     cases = random_segments()
-    ours = shape_distances(*cases)[1]
-    for distance, start, end, half in zip(ours, cases[0], cases[1], cases[4], strict=True):
+    starts, ends, _, _, halves = cases
+    _, boxes = shape_distances(*cases)
+    for distance, start, end, half in zip(boxes, starts, ends, halves, strict=True):
         expected = coal_distance(capsule(start, end, 0.01), box(-half, half)) + 0.01  # less the radius
         assert distance == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # the other segment goes from (0, 0, 0) to (1, 0, 0); all [m]
     ("end_b", "start_b", "expected"),
     [
         ((0, 0.3, 0.4), (1, 0.3, 0.4), 0.5),  # parallel, side by side
@@ -72,7 +73,7 @@ def test_segment_distance_by_hand(start_b, end_b, expected):
     assert distance_sq == pytest.approx(expected**2, rel=1e-6)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # from a segment to the box |x| < 1, |y| < 2, |z| < 3; all [m]
     ("start", "end", "expected"),
     [
         ((1, 0, 4), (2, 0, 3), 0.5**0.5),  # down past the edge x = 1, z = 3, nearest half a metre outside both faces
@@ -82,5 +83,5 @@ def test_segment_distance_by_hand(start_b, end_b, expected):
     ],
 )
 def test_box_distance_by_hand(start, end, expected):
-    distance = shape_distances([start], [end], [start], [end], half=[(1, 2, 3)])[1]
-    assert distance[0] == pytest.approx(expected, abs=1e-6)
+    _, (distance,) = shape_distances([start], [end], [start], [end], half=[(1, 2, 3)])
+    assert distance == pytest.approx(expected, abs=1e-6)

@@ -5,17 +5,8 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from jump_helpers import (
-    DEFAULT_ANGLE,
-    MOTOR_SLOTS,
-    begin_by,
-    edit_episodes,
-    episodes_of,
-    make_env,
-    only,
-    resets_of,
-    resetting,
-)
+from columns import MOTOR_COORDS, POS, XY, Z
+from jump_helpers import DEFAULT_ANGLE, begin_by, edit_episodes, episodes_of, make_env, only, resets_of, resetting
 from jump_starts import PAW_RADIUS, PLACES, Starts, collision_flags, covers
 from jumper_warp.kernels.jump.state import STANCE
 from jumper_warp.registry import make_task
@@ -57,7 +48,7 @@ class Scenes(Starts):
         self.foot = half_extents(self.episodes["heading"])  # [m] (worlds, 2)
         self.has_block = self.block["exists"] == 1
         rows = np.arange(len(self.goal))
-        self.across = np.argmax(np.abs(self.goal[:, :2]), axis=1)  # axis (0 x, 1 y) that a block's near side crosses
+        self.across = np.argmax(np.abs(self.goal[:, XY]), axis=1)  # axis (0 x, 1 y) that a block's near side crosses
         self.way, self.reach = np.abs(self.goal[rows, self.across]), self.foot[rows, self.across]  # [m] along it
 
     def block_field(self, name):
@@ -74,6 +65,7 @@ def sampled_ground_env(name, count, ground, seed=2, reset=None, **changes):
 
 @pytest.fixture(scope="module", params=PLACES)
 def env(request):
+    """Return each task's environment, which draws a platform, a block or level ground at a reset."""
     levels = {"levels": WIDE} if request.param == "omnidirectional-jump" else {}
     return sampled_ground_env(request.param, N, GroundCfg(platform=0.5, block=0.5), **levels)
 
@@ -88,11 +80,13 @@ def scenes(env):
 
 @pytest.fixture(params=["standing", "default"])
 def platform_starts(scenes, request):
+    """Return the `Scenes` with platforms under the robots, in both start modes."""
     return scenes["platform", request.param]
 
 
 @pytest.fixture(params=["standing", "default"])
 def block_starts(scenes, request):
+    """Return the `Scenes` with blocks ahead of the robots, in both start modes."""
     return scenes["block", request.param]
 
 
@@ -100,8 +94,8 @@ def test_all_paws_stand_on_the_platform_away_from_its_edges(platform_starts):
     has_block = platform_starts.has_block
     paws, height = platform_starts.paws[has_block], platform_starts.block_field("height")
     assert has_block.sum() > 500 and covers(height, *DROP)
-    np.testing.assert_allclose(paws[..., 2], height[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-4)
-    inside = platform_starts.block_field("half")[:, None] - np.abs(paws[..., :2])
+    np.testing.assert_allclose(paws[..., Z], height[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-4)
+    inside = platform_starts.block_field("half")[:, None] - np.abs(paws[..., XY])
     assert inside.min() >= MARGIN - 2e-4
     np.testing.assert_allclose(platform_starts.paws[~has_block][..., 2], PAW_RADIUS, atol=2e-4)
 
@@ -116,20 +110,20 @@ def test_platforms_are_at_rest_at_the_origin_with_independent_uniform_extents(pl
 
 def test_base_height_above_a_platform_is_that_of_the_level_or_the_default_pose(env, scenes):
     sample = scenes["platform", "standing"]
-    above, counts = sample.pos[:, 2] - np.where(sample.has_block, sample.block["height"], 0.0), []
+    above, counts = sample.pos[:, Z] - np.where(sample.has_block, sample.block["height"], 0.0), []
     for number, level in enumerate(env.task.levels):
         chosen = sample.has_block & (sample.level == number)
         counts.append(chosen.sum())
         assert counts[-1] == 0 or covers(above[chosen], *level.base_height, 6.0 / counts[-1])
     assert max(counts) > 300, counts
     sample = scenes["platform", "default"]
-    above = sample.pos[:, 2] - np.where(sample.has_block, sample.block["height"], 0.0)
+    above = sample.pos[:, Z] - np.where(sample.has_block, sample.block["height"], 0.0)
     np.testing.assert_allclose(above, env.sim.model.joint_q.numpy()[2], atol=1e-5)
 
 
 def test_a_platform_exists_only_where_paws_land_clear_of_it(platform_starts):
     has_block = platform_starts.has_block
-    apart = np.abs(platform_starts.goal[:, :2]) - 2.0 * platform_starts.foot  # [m] between paws at start and goal
+    apart = np.abs(platform_starts.goal[:, XY]) - 2.0 * platform_starts.foot  # [m] between paws at start and goal
     gap = (apart[has_block] - platform_starts.block_field("half") + platform_starts.foot[has_block]).max(axis=1)
     assert gap.min() >= CLEARANCE - 1e-4 and gap.min() < CLEARANCE + 0.02
     widest = apart.max(axis=1) - MARGIN  # [m] gap to the smallest platform
@@ -153,7 +147,7 @@ def test_a_block_extends_beyond_all_paws_at_the_goal_by_independent_distances(bl
 
 def test_robots_stand_on_the_floor_outside_the_block(block_starts):
     has_block = block_starts.has_block
-    np.testing.assert_allclose(block_starts.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(block_starts.paws[..., Z], PAW_RADIUS, atol=2e-4)
     offset = np.abs(block_starts.paws[has_block, :, :2] - block_starts.block_field("center")[:, None])
     outside = (offset - block_starts.block_field("half")[:, None]).max(axis=2)  # [m] from the block
     assert outside.min() >= MARGIN - 2e-4
@@ -255,7 +249,7 @@ def test_fields_of_missing_blocks_stay_0_while_stepping():
 
 def hold(env, steps=20):
     """Command the present motor angles for `steps` policy steps; fail if an episode ends or a world diverges."""
-    angles = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
+    angles = env.sim.joint_q()[:, MOTOR_COORDS]
     scale = np.radians(np.tile([15.0, 90.0, 90.0], 4))  # action scale of the task
     action = torch.from_numpy((angles - DEFAULT_ANGLE) / scale).float()
     for _ in range(steps):
@@ -274,28 +268,29 @@ def test_robots_and_platforms_stay_at_rest(start_mode):
     assert block["exists"].all()
     hold(env)
     np.testing.assert_allclose(
-        paw_centres(env.sim)[..., 2], block["height"][:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3
+        paw_centres(env.sim)[..., Z], block["height"][:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3
     )
-    assert np.abs(env.sim.joint_q()[:, :3] - before[:, :3]).max() < 0.06
+    assert np.abs(env.sim.joint_q()[:, POS] - before[:, :3]).max() < 0.06
     assert np.abs(env.sim.solver.block_position()).max() < 1e-6
     assert (env.task_arrays()["phase"] == STANCE).all()
     observed_height = env.obs[:, 2]
-    np.testing.assert_allclose(observed_height, env.sim.joint_q()[:, 2] - block["height"], atol=1e-5)
+    np.testing.assert_allclose(observed_height, env.sim.joint_q()[:, Z] - block["height"], atol=1e-5)
 
 
 def test_robots_put_onto_the_block_at_their_goal_stay_at_rest():
+    """After 40 policy steps the paws stand on the block, which has not moved and carries the weight."""
     env = sampled_ground_env("horizontal-jump", 64, KINDS["block"], levels=FAR, reset=only("default", heading=180.0))
     block, episodes = block_fields(env), env.task_arrays()
     assert block["exists"].all()
     q = env.sim.joint_q().copy()
-    q[:, :2] += episodes["goal"][:, :2]
-    q[:, 2] += episodes["goal_ground"]
+    q[:, XY] += episodes["goal"][:, XY]
+    q[:, Z] += episodes["goal_ground"]
     env.sim.state.joint_q.assign(q.ravel())
-    edit_episodes(env, command_step=1000, start=q[:, :3])
+    edit_episodes(env, command_step=1000, start=q[:, POS])
     assert not collision_flags(env).any()
     hold(env, 40)
     np.testing.assert_allclose(
-        paw_centres(env.sim)[..., 2], block["height"][:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3
+        paw_centres(env.sim)[..., Z], block["height"][:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3
     )
-    np.testing.assert_allclose(paw_forces(env.sim)[..., 2].sum(axis=1), WEIGHT, rtol=0.05)
+    np.testing.assert_allclose(paw_forces(env.sim)[..., Z].sum(axis=1), WEIGHT, rtol=0.05)
     assert np.abs(env.sim.solver.block_position() - block["center"]).max() < 2e-3

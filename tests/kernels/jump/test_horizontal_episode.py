@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from columns import XY
 from jump_helpers import DEG, edit_coordinates, edit_episodes, ending_names, episodes_of, make_env, only, random_actions
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
@@ -82,7 +83,7 @@ def test_an_evaluation_starts_with_its_heading_and_goal_before_the_command(turn)
     goals = np.array([[0.8, 0.2, 0.0], [0.3, -0.1, 0.0]])
     env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt), headings=turn * DEG)
     arrays = env.task_arrays()
-    np.testing.assert_allclose(arrays["goal"][:, :2] @ [[math.cos(turn * DEG), -math.sin(turn * DEG)],
+    np.testing.assert_allclose(arrays["goal"][:, XY] @ [[math.cos(turn * DEG), -math.sin(turn * DEG)],
                                                         [math.sin(turn * DEG), math.cos(turn * DEG)]],
                                [[0.8, 0.2], [0.3, -0.1]], atol=1e-5)  # fmt: skip
     np.testing.assert_allclose(arrays["heading"], turn * DEG, atol=1e-6)

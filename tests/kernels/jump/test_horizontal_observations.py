@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import DEG, MOTOR_SLOTS, Robots, edit_episodes, make_env, make_episode, only, without_draws
+from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, POS, QUAT, X, Z
+from jump_helpers import DEG, Robots, edit_episodes, make_env, make_episode, only, without_draws
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.mirror import LEGS, mirror_of
@@ -26,10 +27,13 @@ def random_robots(task, turn=0.0, seed=0):
     heading[:50] = np.pi + rng.uniform(-0.02, 0.02, 50)  # around the jump of the yaw at pi
     tilt = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (N, 3)))
     world = Rotation.from_euler("z", turn)
-    robots.q[:, :3] = world.apply(rng.uniform(-1.0, 1.0, (N, 3)))
-    robots.q[:, 3:7] = (world * Rotation.from_euler("z", heading[:, None]) * tilt).as_quat()
-    robots.q[:, 7 + MOTOR_SLOTS] += rng.uniform(-1.0, 1.0, (N, 12))
-    robots.qd[:, :3], robots.qd[:, 3:6] = world.apply(rng.normal(size=(N, 3))), world.apply(rng.normal(size=(N, 3)))
+    robots.q[:, POS] = world.apply(rng.uniform(-1.0, 1.0, (N, 3)))
+    robots.q[:, QUAT] = (world * Rotation.from_euler("z", heading[:, None]) * tilt).as_quat()
+    robots.q[:, MOTOR_COORDS] += rng.uniform(-1.0, 1.0, (N, 12))
+    robots.qd[:, LIN_VEL], robots.qd[:, ANG_VEL] = (
+        world.apply(rng.normal(size=(N, 3))),
+        world.apply(rng.normal(size=(N, 3))),
+    )
     robots.qd[:, 6:] = rng.normal(size=(N, 32))
     robots.com = rng.uniform(-0.05, 0.05, 3)
     robots.action, robots.offset = rng.uniform(-1.0, 1.0, (12, N)), rng.uniform(-0.03, 0.03, (12, N))
@@ -117,7 +121,7 @@ def test_noise_of_goal_and_height_is_independent_and_clamped_at_one_sigma(steps)
 def test_height_is_measured_from_the_ground_below_the_base():
     robots = Robots(HORIZONTAL, 2)
     robots.heights = np.array([[0.0, 0.0, -0.15], [0.0, 0.0, -0.15]])  # falls from x = 0 to x = 2 m
-    robots.q[:, 0], robots.q[:, 2] = (-1.0, 1.0), (0.4, 0.3)
+    robots.q[:, X], robots.q[:, Z] = (-1.0, 1.0), (0.4, 0.3)
     np.testing.assert_allclose(robots.observe()[:, 2], [0.4, 0.3 + 0.075], atol=1e-6)
 
 
@@ -187,6 +191,7 @@ def test_the_critic_gets_paw_forces_in_body_weights_up_to_five():
 
 @pytest.fixture(scope="module")
 def env():
+    """Return horizontal jumps of 256 randomised robots with noise, in the default pose."""
     return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
 
 
@@ -239,7 +244,7 @@ def test_block_ahead_matches_sampling_along_three_rays():
     observed = env.obs[:, -BLOCK:].numpy()
     np.testing.assert_array_equal(env.critic_obs[:, ROBOT : ROBOT + BLOCK], observed)
     q = env.sim.joint_q()
-    yaw = np.arctan2(*Rotation.from_quat(q[:, 3:7]).apply([1.0, 0.0, 0.0])[:, 1::-1].T)
+    yaw = np.arctan2(*Rotation.from_quat(q[:, QUAT]).apply([1.0, 0.0, 0.0])[:, 1::-1].T)
     sides = [(0, 0.2), (1, 0.0), (2, -0.2)]  # (ray, distance to the left of the base [m])
     for world in range(256):
         for ray, aside in sides:
@@ -264,10 +269,10 @@ def test_observations_of_a_mirrored_robot_are_the_mirror_image(task):
     flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of angular velocities
     joints = [5 * leg + j for leg in LEGS for j in range(5)]
     motors = [3 * leg + j for leg in LEGS for j in range(3)]
-    robots.q[:, :3] *= flip
-    robots.q[:, 3:7] *= [-1.0, 1.0, -1.0, 1.0]
+    robots.q[:, POS] *= flip
+    robots.q[:, QUAT] *= [-1.0, 1.0, -1.0, 1.0]
     robots.q[:, 7:27] = robots.q[:, 7:27][:, joints]
-    robots.qd[:, :3], robots.qd[:, 3:6] = robots.qd[:, :3] * flip, robots.qd[:, 3:6] * spin
+    robots.qd[:, LIN_VEL], robots.qd[:, ANG_VEL] = robots.qd[:, LIN_VEL] * flip, robots.qd[:, ANG_VEL] * spin
     robots.qd[:, 6:26] = robots.qd[:, 6:26][:, joints]
     robots.com = robots.com * flip
     robots.action, robots.offset = robots.action[motors], robots.offset[motors]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from columns import ANG_VEL, MOTOR_COORDS, MOTOR_DOFS, QUAT, XY, X, Y, Z
 from jump_helpers import DEG, START_MODES, begin_by, edit_episodes, episodes_of, make_env, only, resets_of, set_levels
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 G = 9.81  # [m/s^2]
@@ -25,8 +25,8 @@ def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, n
     place, when = np.full_like(pos, np.nan), np.full(len(pos), np.nan)
     for step in range(600):
         after = pos + dt * vel - [0.0, 0.0, 0.5 * G * dt**2]
-        through = np.isnan(when) & (pos[:, 2] >= height) & (after[:, 2] < height)
-        fraction = (pos[:, 2] - height) / np.maximum(pos[:, 2] - after[:, 2], 1e-12)
+        through = np.isnan(when) & (pos[:, Z] >= height) & (after[:, Z] < height)
+        fraction = (pos[:, Z] - height) / np.maximum(pos[:, Z] - after[:, Z], 1e-12)
         place[through] = (pos + fraction[:, None] * (after - pos))[through]
         when[through] = dt * (step + fraction[through])
         pos, vel = after, vel - [0.0, 0.0, G * dt]
@@ -35,6 +35,7 @@ def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, n
 
 @pytest.fixture(scope="module", params=PLACES)
 def env(request):
+    """Return an environment of each task with a horizontal goal."""
     return make_env(N, task=make_task(request.param), seed=1)
 
 
@@ -60,7 +61,7 @@ def test_start_modes_have_the_tasks_probabilities(env):
 @pytest.mark.parametrize("start_mode", START_MODES)
 def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
     assert not starts[start_mode].flags.any()
-    angles = starts[start_mode].q[:, MOTOR_Q].reshape(-1, 4, 3)
+    angles = starts[start_mode].q[:, MOTOR_COORDS].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 15.0 * DEG + 1e-4
     sums = angles[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
@@ -78,7 +79,7 @@ def test_headings_cover_the_circle_and_attitudes_their_ranges(env, starts, start
     assert covers(heading, -np.pi, np.pi, 0.01)
     fractions = np.histogram(heading, np.linspace(-np.pi, np.pi, 9))[0] / len(heading)
     assert np.abs(fractions - 0.125).max() < 5.0 * np.sqrt(0.125 * 0.875 / len(heading))
-    body = (sample.heading.inv() * Rotation.from_quat(sample.q[:, 3:7])).as_euler("ZYX")
+    body = (sample.heading.inv() * Rotation.from_quat(sample.q[:, QUAT])).as_euler("ZYX")
     if start_mode in ("in_flight", "touchdown", "pushing"):  # nose down in the mean
         down = env.task.reset.settings.takeoff_pitch[1] * DEG
         assert covers(body[:, 1], -5.0 * DEG, down + 5.0 * DEG, 0.1)
@@ -90,7 +91,7 @@ def test_headings_cover_the_circle_and_attitudes_their_ranges(env, starts, start
 
 
 def test_only_horizontal_jumps_stand_pitched_forward(env, starts):
-    body = (starts["standing"].heading.inv() * Rotation.from_quat(starts["standing"].q[:, 3:7])).as_euler("ZYX")
+    body = (starts["standing"].heading.inv() * Rotation.from_quat(starts["standing"].q[:, QUAT])).as_euler("ZYX")
     mean = 10.0 * DEG if env.task.name == "horizontal-jump" else 0.0
     assert covers(body[:, 1], -5.0 * DEG, mean + 5.0 * DEG, 0.1)
     # 0.15: samples that lean back are rejected more often, which raises the mean pitch
@@ -103,13 +104,13 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
     ahead = sample.heading.inv().apply(sample.goal)
     for number, level in enumerate(env.task.levels):
         here = ahead[sample.level == number]
-        for axis in (0, 1):
+        for axis in (X, Y):
             assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.05)
         if level.elliptical:
-            half_axes = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, :2]
-            radius = np.linalg.norm(here[:, :2] / half_axes, axis=1)
+            half_axes = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, XY]
+            radius = np.linalg.norm(here[:, XY] / half_axes, axis=1)
             assert radius.max() <= 1.0 + 1e-4 and np.histogram(radius, 4, (0.0, 1.0))[0].min() > 0
-    assert not sample.episodes["goal"][:, 2].any()
+    assert not sample.episodes["goal"][:, Z].any()
 
 
 def test_phases_and_the_command_fit_the_start_mode(starts):
@@ -131,16 +132,16 @@ def test_phases_and_the_command_fit_the_start_mode(starts):
 def test_standing_starts_have_paws_in_their_boxes_and_lean_back_the_lower_they_are(env, starts):
     sample = starts["standing"]
     paws = sample.paws_around(np.zeros_like(sample.pos))
-    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
-    assert covers(paws[..., 0], 0.20, 0.22)
+    np.testing.assert_allclose(sample.paws[..., Z], PAW_RADIUS, atol=2e-4)
+    assert covers(paws[..., X], 0.20, 0.22)
     assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
     level = np.array([level.base_height for level in env.task.levels])[sample.level]
     behind, aside = sample.split((np.zeros(3) - sample.pos) * [1.0, 1.0, 0.0])
-    low = (level[:, 1] - sample.pos[:, 2]) / (level[:, 1] - level[:, 0])
+    low = (level[:, 1] - sample.pos[:, Z]) / (level[:, 1] - level[:, 0])
     lean = env.task.reset.settings.lean
     assert (behind >= -CORNER - 1e-5).all() and (behind <= lean * low + CORNER + 1e-5).all()
     assert np.abs(aside).max() <= CORNER + 1e-5 and behind[low > 0.9].max() > 0.8 * lean
-    assert (sample.episodes["start"][:, :2] == 0.0).all()  # middle of the paws, not the leaning base
+    assert (sample.episodes["start"][:, XY] == 0.0).all()  # middle of the paws, not the leaning base
     for number, level in enumerate(env.task.levels):
         assert covers(sample.pos[sample.level == number, 2], *level.base_height)
     assert not sample.qd.any()
@@ -148,12 +149,12 @@ def test_standing_starts_have_paws_in_their_boxes_and_lean_back_the_lower_they_a
 
 def test_landed_starts_are_around_their_goal_with_paws_on_the_ground_and_move_down(starts):
     sample = starts["after_landing"]
-    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(sample.paws[..., Z], PAW_RADIUS, atol=2e-4)
     paws = sample.paws_around(sample.goal)
-    assert covers(paws[..., 0], 0.20, 0.22)
+    assert covers(paws[..., X], 0.20, 0.22)
     assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
-    assert covers(sample.pos[:, 2], 0.30, 0.45)
-    assert covers(-sample.vel[:, 2], 0.0, 1.0) and not sample.vel[:, :2].any()
+    assert covers(sample.pos[:, Z], 0.30, 0.45)
+    assert covers(-sample.vel[:, Z], 0.0, 1.0) and not sample.vel[:, XY].any()
     exact = starts["exact after_landing"]
     ahead, aside = exact.split((exact.pos - exact.goal) * [1.0, 1.0, 0.0])
     assert covers(ahead, -0.15, 0.10) and np.abs(aside).max() < 1e-5
@@ -170,17 +171,17 @@ def test_pushing_starts_accelerate_to_a_takeoff_whose_flight_ends_at_the_goal(en
     along = sample.vel[moving] / speed[moving, None]
     takeoff_speed = np.sqrt(speed[moving] ** 2 + 2.0 * 15.0 * 0.2)
     takeoff = sample.pos[moving] + 0.2 * along
-    assert takeoff[:, 2].min() >= 0.40 - 1e-4 and takeoff[:, 2].max() <= 0.45 + 1e-4
+    assert takeoff[:, Z].min() >= 0.40 - 1e-4 and takeoff[:, Z].max() <= 0.45 + 1e-4
     place, _ = land(takeoff, takeoff_speed[:, None] * along, LANDING_HEIGHT)
-    np.testing.assert_allclose(place[:, :2], sample.goal[moving, :2], atol=1e-3)
-    assert (sample.episodes["start"][:, :2] == 0.0).all()
+    np.testing.assert_allclose(place[:, XY], sample.goal[moving, :2], atol=1e-3)
+    assert (sample.episodes["start"][:, XY] == 0.0).all()
 
 
 def test_paws_of_a_push_rest_on_the_ground_around_the_start(starts):
     sample = starts["pushing"]
-    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(sample.paws[..., Z], PAW_RADIUS, atol=2e-4)
     paws = sample.paws_around(np.zeros_like(sample.pos))
-    assert covers(paws[..., 0], 0.20, 0.22)
+    assert covers(paws[..., X], 0.20, 0.22)
     assert np.linalg.norm(sample.vel, axis=1).max() > 3.0  # [m/s] nearly a takeoff
 
 
@@ -219,34 +220,34 @@ def test_ballistic_flights_end_at_the_goal(starts):
     place, _ = land(sample.pos, sample.vel, LANDING_HEIGHT)
     assert not np.isnan(place).any()
     miss = place - sample.goal
-    np.testing.assert_allclose(miss[:, :2], 0.0, atol=5e-4)
+    np.testing.assert_allclose(miss[:, XY], 0.0, atol=5e-4)
     miss = (land(spread.pos, spread.vel, LANDING_HEIGHT)[0] - spread.goal)[spread.distance >= 0.1]
-    assert covers(miss[:, 0], -0.05, 0.05) and covers(miss[:, 1], -0.05, 0.05)
+    assert covers(miss[:, X], -0.05, 0.05) and covers(miss[:, Y], -0.05, 0.05)
 
 
 def test_flights_take_off_within_the_ranges_of_angle_height_and_apex(starts):
     sample = starts["exact in_flight"]
     _, left = land(sample.pos, sample.vel, LANDING_HEIGHT)
     # [m/s] takeoff speeds for 0.02 and 0.10, the ends of `flight_time`, of the flight's duration passed
-    up = [sample.vel[:, 2] + G * left * fraction / (1.0 - fraction) for fraction in (0.02, 0.10)]
-    forward = np.linalg.norm(sample.vel[:, :2], axis=1)
-    apex = sample.pos[:, 2] + np.maximum(sample.vel[:, 2], 0.0) ** 2 / (2.0 * G)
+    up = [sample.vel[:, Z] + G * left * fraction / (1.0 - fraction) for fraction in (0.02, 0.10)]
+    forward = np.linalg.norm(sample.vel[:, XY], axis=1)
+    apex = sample.pos[:, Z] + np.maximum(sample.vel[:, Z], 0.0) ** 2 / (2.0 * G)
     assert apex.max() <= 1.0 + 1e-4
     free = (apex < 0.999) & (sample.distance > 0.15)
     shallowest, steepest = (np.degrees(np.arctan2(v, forward)) for v in up)
     assert shallowest[free].max() <= 75.0 + 0.1 and steepest[free].min() >= 35.0 - 0.1
     assert np.ptp(0.5 * (shallowest + steepest)[free]) > 35.0
-    start = [sample.pos[:, 2] - v * t + 0.5 * G * t**2 for v, t in zip(up, (left / 49.0, left / 9.0), strict=True)]
+    start = [sample.pos[:, Z] - v * t + 0.5 * G * t**2 for v, t in zip(up, (left / 49.0, left / 9.0), strict=True)]
     assert np.maximum(*start).min() >= 0.40 - 1e-3 and np.minimum(*start).max() <= 0.45 + 1e-3
 
 
 def test_flights_begin_with_resting_bent_legs_and_paws_off_the_ground(starts):
     sample = starts["in_flight"]
-    angles = sample.q[:, MOTOR_Q].reshape(-1, 4, 3)
+    angles = sample.q[:, MOTOR_COORDS].reshape(-1, 4, 3)
     assert covers(angles[..., 1:], 40.0 * DEG, 80.0 * DEG)
     assert covers(angles[..., 0], -10.0 * DEG - 0.03, 10.0 * DEG + 0.03, 0.1)
-    assert sample.paws[..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
-    assert not sample.qd[:, MOTOR_V].any() and not sample.qd[:, 3:6].any()
+    assert sample.paws[..., Z].min() >= PAW_RADIUS + 0.01 - 1e-4
+    assert not sample.qd[:, MOTOR_DOFS].any() and not sample.qd[:, ANG_VEL].any()
 
 
 def test_touchdown_starts_lag_behind_the_flight_to_the_goal_by_touchdown_behind(env, starts):
@@ -277,11 +278,11 @@ def test_touchdown_starts_have_their_paws_ahead_of_the_base_towards_the_goal(env
 
 def test_touchdown_starts_have_resting_paws_at_one_height_above_the_ground(starts):
     sample = starts["touchdown"]
-    depth, height = sample.pos[:, 2, None] - sample.paws[..., 2], sample.pos[:, 2, None]
-    assert np.ptp(sample.paws[..., 2], axis=1).max() < 2e-4
-    assert sample.paws[..., 2].min() >= 0.05 - 1e-4
+    depth, height = sample.pos[:, 2, None] - sample.paws[..., Z], sample.pos[:, 2, None]
+    assert np.ptp(sample.paws[..., Z], axis=1).max() < 2e-4
+    assert sample.paws[..., Z].min() >= 0.05 - 1e-4
     assert depth.max() <= 0.45 + 1e-4 and (depth >= np.minimum(0.30, height - 0.05) - 2e-4).all()
-    assert (sample.pos[:, 2] > LANDING_HEIGHT - 1e-4).all() and not sample.qd[:, MOTOR_V].any()
+    assert (sample.pos[:, Z] > LANDING_HEIGHT - 1e-4).all() and not sample.qd[:, MOTOR_DOFS].any()
 
 
 def test_touchdown_starts_of_far_goals_fall(starts):

@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from jump_helpers import DEFAULT_ANGLE, DEG, MOTOR_SLOTS, Robots, make_episode, without_draws
+from columns import MOTOR_COORDS, MOTOR_DOFS
+from jump_helpers import DEFAULT_ANGLE, DEG, Robots, make_episode, without_draws
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 
@@ -42,8 +43,8 @@ def test_observation_of_a_robot_at_rest():
 
 def test_joints_are_in_motor_order_and_angles_relative_to_default():
     robots = standing_robots()
-    robots.q[0, 7 + MOTOR_SLOTS] = DEFAULT_ANGLE + 0.01 * np.arange(12)
-    robots.qd[0, 6 + MOTOR_SLOTS] = np.arange(12.0)
+    robots.q[0, MOTOR_COORDS] = DEFAULT_ANGLE + 0.01 * np.arange(12)
+    robots.qd[0, MOTOR_DOFS] = np.arange(12.0)
     robots.action[:, 0] = -0.05 * np.arange(12)
     obs = robots.observe()[0]
     np.testing.assert_allclose(obs[columns_of("angle", MOTORS)], 0.01 * np.arange(12), atol=1e-6)

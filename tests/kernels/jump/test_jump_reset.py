@@ -5,6 +5,7 @@ import newton
 import numpy as np
 import pytest
 
+from columns import MOTOR_COORDS, MOTOR_DOFS, POS, QUAT, X, Y, Z
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
@@ -20,7 +21,6 @@ from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability
-from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 TASK = make_task("vertical-jump")
@@ -31,6 +31,7 @@ PROBABILITIES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
 
 @pytest.fixture(scope="module")
 def all_modes_env():
+    """Return an environment whose episodes begin in every kind of start state."""
     return make_env(N, reset=ALL_MODES)
 
 
@@ -45,6 +46,7 @@ def sampled(request, all_modes_env):
 
 @pytest.fixture(scope="module")
 def other_env():
+    """Return an environment whose settings tests change, by `reset_env`."""
     return make_env(N, seed=1)
 
 
@@ -98,7 +100,7 @@ def test_phase_and_counters_fit_the_start_mode(sampled):
     landed = episodes["phase"] == LANDED
     assert covers_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
     # max_height of a falling or landed robot is the commanded height
-    passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, 2] <= 0.0))
+    passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, Z] <= 0.0))
     np.testing.assert_array_equal(episodes["apex_passed"], passed)
     np.testing.assert_allclose(episodes["max_height"][passed], episodes["goal"][passed, 2], rtol=2e-7)
 
@@ -106,11 +108,11 @@ def test_phase_and_counters_fit_the_start_mode(sampled):
 def test_goals_and_starts_are_within_the_level(sampled):
     env, episodes, q, _ = sampled
     level = env.task.levels[episodes["level"][0]]
-    assert covers_range(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
+    assert covers_range(episodes["goal"][:, Z], level.goal_lower[Z], level.goal_upper[Z])
     standing = worlds_with_mode(episodes, "standing", N)
-    assert covers_range(q[standing, 2], *level.base_height)
-    np.testing.assert_array_equal(episodes["start"], q[:, :3].astype(np.float32))
-    default = q[worlds_with_mode(episodes, "default", N)][:, MOTOR_Q]
+    assert covers_range(q[standing, Z], *level.base_height)
+    np.testing.assert_array_equal(episodes["start"], q[:, POS].astype(np.float32))
+    default = q[worlds_with_mode(episodes, "default", N)][:, MOTOR_COORDS]
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
 
 
@@ -142,19 +144,21 @@ def test_paws_of_grounded_starts_are_at_rest_on_the_ground_within_their_boxes(sa
     env, episodes, _, _ = sampled
     worlds = worlds_with_mode(episodes, start_mode)
     position, velocity = paws_and_velocities(env, worlds)
-    np.testing.assert_allclose(position[..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(position[..., Z], PAW_RADIUS, atol=2e-4)
     np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
     if start_mode != "default":
+        # [m] of each paw outward of the middle, along x and y; paws FL, FR, BL, BR
         spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
-        assert covers_range(spots[..., 0], 0.20, 0.22, 0.1)
-        assert covers_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and covers_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
+        front, back = slice(0, 2), slice(2, 4)
+        assert covers_range(spots[..., X], 0.20, 0.22, 0.1)
+        assert covers_range(spots[:, front, Y], 0.15, 0.17, 0.1) and covers_range(spots[:, back, Y], 0.20, 0.22, 0.1)
 
 
 def test_landed_starts_move_down_with_moving_legs(sampled):
     _, episodes, q, qd = sampled
     worlds = worlds_with_mode(episodes, "after_landing", N)
     assert covers_range(-qd[worlds, 2], 0.0, 1.0) and covers_range(q[worlds, 2], 0.30, 0.42)
-    assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
+    assert np.abs(qd[worlds][:, MOTOR_DOFS]).max() > 1.0
 
 
 @pytest.mark.parametrize("start_mode", ["in_flight", "touchdown"])
@@ -168,7 +172,7 @@ def test_apex_of_flights_is_the_commanded_height(sampled, start_mode):
     assert reachable.mean() > 0.95
     np.testing.assert_allclose(apex[reachable], goal[reachable], atol=2e-5)
     assert (q[worlds, 2] > 0.39).all()
-    assert not qd[worlds][:, MOTOR_V].any()
+    assert not qd[worlds][:, MOTOR_DOFS].any()
     # touchdowns begin at most 0.15 s before landing: after the apex of a jump of more than 0.3 s
     rising = np.mean(qd[worlds[goal > 0.6], 2] > 0.0)
     assert rising == 0.0 if start_mode == "touchdown" else 0.3 < rising < 0.7
@@ -176,7 +180,7 @@ def test_apex_of_flights_is_the_commanded_height(sampled, start_mode):
 
 def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(sampled):
     env, episodes, q, _ = sampled
-    angles = q[worlds_with_mode(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
+    angles = q[worlds_with_mode(episodes, "in_flight", N)][:, MOTOR_COORDS].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 10.0 * DEG + 0.03 + 1e-5
     assert covers_range(angles[..., 1:], 0.0, 90.0 * DEG)
     worlds = worlds_with_mode(episodes, "touchdown")
@@ -192,9 +196,9 @@ def test_no_state_collides_and_paws_are_not_under_the_ground(sampled):
     assert not collision_flags(env).any()
     flying = worlds_with_mode(episodes, "in_flight")
     assert paws_and_velocities(env, flying)[0][..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
-    sums = q[:, MOTOR_Q].reshape(N, 4, 3)[..., 1:].sum(axis=2)
+    sums = q[:, MOTOR_COORDS].reshape(N, 4, 3)[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 240.0 * DEG + 1e-4
-    assert np.abs(q[:, MOTOR_Q[::3]]).max() <= 15.0 * DEG + 1e-4
+    assert np.abs(q[:, MOTOR_COORDS[::3]]).max() <= 15.0 * DEG + 1e-4
 
 
 def test_colliding_samples_are_rejected(reset_with):
@@ -236,7 +240,7 @@ def test_an_unreachable_start_becomes_the_default_pose():
 
 def test_standing_starts_sample_heading_and_forward_pitch_and_turn_paws_with_the_heading(reset_with):
     env = reset_with(only("standing", heading=180.0, forward_pitch=10.0))
-    angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
+    angles = euler(env.sim.joint_q()[:, QUAT].astype(float))
     # a mean from 0 to 10 degrees, and 5 degrees to either side of it
     assert covers_range(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
     spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
@@ -254,7 +258,7 @@ def test_goals_of_worlds_past_the_last_level_are_those_of_a_uniform_level(reset_
     env = reset_with(ResetCfg())
     edit_episodes(env, level=len(TASK.levels))
     env.reset()
-    goals, levels = env.task_arrays()["goal"][:, 2], set(env.task_arrays()["level"])
+    goals, levels = env.task_arrays()["goal"][:, Z], set(env.task_arrays()["level"])
     edit_episodes(env, level=0)
     lower, upper = [np.array([getattr(level, end)[2] for level in TASK.levels]) for end in ("goal_lower", "goal_upper")]
     heights = np.linspace(0.4, 1.3, 19)  # [m] at which distribution functions are compared

@@ -2,6 +2,7 @@
 
 import importlib
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -176,14 +177,26 @@ def random_motors(seed):
     return np.hstack([np.radians(angles), rng.uniform(-1.0, 1.0, (SAMPLES, 2))])
 
 
+class Case(NamedTuple):
+    """Random motions of a leg: the kernel's results, the inputs of the reference, and the tolerance between both."""
+
+    fields: dict[str, np.ndarray]  # FIELDS (n, 2) and SCALARS (n,)
+    leg: dict  # `leg_geometry`
+    outer: np.ndarray  # (n,) [rad]
+    inner: np.ndarray  # (n,) [rad]
+    rates: np.ndarray  # (2, n) [rad/s] of outer and inner
+    shanks: np.ndarray  # (2, n) [rad]
+    tolerance: float
+
+
 @pytest.fixture(scope="module", params=range(4), ids=["FL", "FR", "BL", "BR"])
 def case(request, build):
-    """Return (kernel's fields, leg geometry, outer (n,), inner (n,), rates (2, n), shanks (2, n), tolerance)."""
+    """Return the `Case` of each leg."""
     leg = leg_geometry(load_description())[request.param]
     # rounded to the kernel's precision, so that kernel and reference have the same inputs
     motors = random_motors(request.param).astype(build.numpy_real).astype(np.float64)
     outer, inner, rates = motors[:, 0], motors[:, 1], motors[:, 2:].T
-    return build(request.param, motors), leg, outer, inner, rates, assemble(leg, outer, inner), build.tolerance
+    return Case(build(request.param, motors), leg, outer, inner, rates, assemble(leg, outer, inner), build.tolerance)
 
 
 def assert_close(actual, expected, tolerance):
@@ -206,7 +219,7 @@ def test_ankle_of_symmetric_leg_by_hand(build, angle, depth):
 def test_jacobian_of_symmetric_leg_by_hand(build):
     # depth = 0.175 cos a + sqrt(0.09 - w^2), w = 0.045 + 0.175 sin a; at 45 degrees w = 0.168744, sqrt = 0.248046
     fields = build(0, np.radians([[45.0, 45.0, 0.0, 0.0]]))
-    rise = fields["ankle_do"][0, 1] + fields["ankle_di"][0, 1]  # [m/rad] d ankle z / d a
+    _, rise = fields["ankle_do"][0] + fields["ankle_di"][0]  # [m/rad] d (x, z) of the ankle / d a
     assert rise == pytest.approx(0.123744 + 0.168744 * 0.123744 / 0.248046, abs=2.0e-6)
 
 
@@ -217,7 +230,7 @@ def test_parallel_thighs_move_ankle_on_a_circle(build):
     assert fields["ankle_acc"][0] == pytest.approx([0.0, 0.175], abs=1.0e-6)
 
 
-def test_coinciding_knees_give_finite_values(build):
+def test_five_bar_with_coinciding_knees_is_finite(build):
     angle = -math.asin(0.045 / 0.175)  # both knees at the middle of the axes, which are 2 x 0.045 m apart
     fields = build(0, np.array([[angle, angle, 10.0, -10.0]]))
     assert all(np.isfinite(value).all() for value in fields.values())
@@ -247,13 +260,15 @@ def test_derivatives_match_complex_step(case):
 
 
 def test_rates_match_complex_step(case):
+    """Rates of the links [rad/s] are derivatives of their rotations along the motors' rates."""
     fields, leg, outer, inner, rates, shanks, tolerance = case
     want = derivative(leg, outer, inner, shanks, rates)
     for name in LINKS:
         assert_close(fields[f"{name}_rate"], want[name], tolerance)
 
 
-def test_bias_matches_second_differences(case):
+def test_bias_accelerations_match_second_differences(case):
+    """At constant motor rates points and shanks accelerate by the second derivative along the rates."""
     fields, leg, outer, inner, rates, shanks, tolerance = case
     want = second_derivative(leg, outer, inner, shanks, rates)
     # twice the tolerance: products of two rates, which partly cancel, are summed up to four at a time

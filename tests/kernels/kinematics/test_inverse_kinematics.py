@@ -5,6 +5,7 @@ Motor angles are (12, n): lateral, outer, inner of FL, FR, BL, BR for n robots. 
 
 import importlib
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +14,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from columns import Y, Z
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry, leg_geometry_array
 from jumper_warp.robot.pinocchio_model import build_pinocchio
@@ -23,6 +25,16 @@ TRANSVERSAL = (-30.0, 140.0)
 SUM = (0.0, 240.0)
 """[deg] Hard stops of the robot."""
 ROBOTS = 200
+
+
+class Legs(NamedTuple):
+    """Legs of n robots, each (4, n, ...), in the body frame."""
+
+    ankle: np.ndarray  # (4, n, 3) [m]
+    jacobian: np.ndarray  # (4, n, 3, 3) [m/rad] of the ankle by lateral, outer, inner
+    knees: np.ndarray  # (4, n, 2) [rad] outer, inner
+    rates: np.ndarray  # (4, n, 3) [rad/s] motor rates that move the ankle by the given velocity
+    knee_rates: np.ndarray  # (4, n, 2) [rad/s]
 
 
 def make_leg_kernel(package):
@@ -93,7 +105,7 @@ class Build:
         return [array.numpy() for array in out]
 
     def legs_at(self, motors, ankle_vel=None):
-        """Return ankles, Jacobians, knees (outer, inner), motor rates and knee rates of all legs, each (4, n, ...).
+        """Return the `Legs` at motor angles.
 
         motors [rad]: (12, n); ankle_vel [m/s]: (4, n, 3), None: zero; all in the body frame.
         """
@@ -102,7 +114,7 @@ class Build:
         inputs.append(self.array(np.zeros((4, n, 3)) if ankle_vel is None else ankle_vel, s.vec3))
         out = [self.zeros(4, n, dtype) for dtype in (s.vec3, s.mat33, s.vec2, s.vec3, s.vec2)]
         wp.launch(self.leg_kernel, (4, n), inputs, out, device="cpu")
-        return [array.numpy() for array in out]
+        return Legs(*(array.numpy() for array in out))
 
 
 @pytest.fixture(scope="module", params=["jumper_warp.kernels", "jumper_warp.kernels_float64"])
@@ -153,7 +165,7 @@ def reached_by_pinocchio(robot, q):
 
 def test_paw_positions_of_default_pose_by_hand(build):
     motors = np.tile(np.radians([0.0, 45.0, 45.0]), 4)[:, None]
-    ankle = build.legs_at(motors)[0][:, 0]
+    ankle = build.legs_at(motors).ankle[:, 0]
     # x: 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075; z: five-bar at 45 degrees
     want = [[0.24, 0.1652, -0.3718], [0.24, -0.1652, -0.3718], [-0.24, 0.2102, -0.3718], [-0.24, -0.2102, -0.3718]]
     np.testing.assert_allclose(ankle, want, atol=5.0e-5)
@@ -161,19 +173,19 @@ def test_paw_positions_of_default_pose_by_hand(build):
 
 def test_positive_lateral_angle_swings_paws_outward_about_the_hip(build):
     motors = np.tile(np.radians([90.0, 0.0, 0.0]), 4)[:, None]
-    ankle = build.legs_at(motors)[0][:, 0]
+    ankle = build.legs_at(motors).ankle[:, 0]
     # a quarter turn about the hip: out by the leg's 0.4716, and the plane's offset of 0.0602 points up
-    assert ankle[:, 1] == pytest.approx([0.105 + 0.4716, -0.105 - 0.4716, 0.15 + 0.4716, -0.15 - 0.4716], abs=5.0e-5)
-    assert ankle[:, 2] == pytest.approx(0.0602, abs=5.0e-5)
+    assert ankle[:, Y] == pytest.approx([0.105 + 0.4716, -0.105 - 0.4716, 0.15 + 0.4716, -0.15 - 0.4716], abs=5.0e-5)
+    assert ankle[:, Z] == pytest.approx(0.0602, abs=5.0e-5)
 
 
 def test_jacobian_matches_central_differences(double):
     motors, size = random_motors(ROBOTS), 1.0e-5  # [rad]
-    jacobian = double.legs_at(motors)[1]
+    jacobian = double.legs_at(motors).jacobian
     for joint in range(3):
         step = np.zeros((12, 1))
         step[joint::3] = size
-        difference = (double.legs_at(motors + step)[0] - double.legs_at(motors - step)[0]) / (2.0 * size)
+        difference = (double.legs_at(motors + step).ankle - double.legs_at(motors - step).ankle) / (2.0 * size)
         np.testing.assert_allclose(jacobian[:, :, :, joint], difference, atol=2.0e-8)  # [m/rad]
 
 
@@ -199,18 +211,18 @@ def test_inverse_kinematics_closes_the_loop_in_pinocchio(build, robot):
 
 
 def test_every_paw_position_within_limits_is_reached(build):
-    paws = build.legs_at(random_motors(5000, seed=2))[0]
+    paws = build.legs_at(random_motors(5000, seed=2)).ankle
     motors, _, reachable, residual = build.solve(paws)
     assert reachable.all()
     assert residual.max() < (1.0e-12 if build.double else 1.0e-6)
-    np.testing.assert_allclose(build.legs_at(motors)[0], paws, atol=1.0e-12 if build.double else 1.0e-6)
+    np.testing.assert_allclose(build.legs_at(motors).ankle, paws, atol=1.0e-12 if build.double else 1.0e-6)
 
 
 def test_inverse_kinematics_inverts_forward_kinematics_with_bent_knees(build):
     # thighs at 10 degrees or more bend both knees
     rng = np.random.default_rng(3)
     want = np.radians(rng.uniform(10.0, 100.0, (12, 500)))
-    motors, knees, _, _ = build.solve(build.legs_at(want)[0])
+    motors, knees, _, _ = build.solve(build.legs_at(want).ankle)
     np.testing.assert_allclose(motors, want, atol=1.0e-11 if build.double else 2.0e-5)
     assert (knees > 0.0).all()
 
@@ -235,7 +247,7 @@ def into_limits(q):
     """Return joint angles [rad] (..., 3) clipped to the hard stops; an excess of the sum is halved between its two."""
     lower, upper = np.radians([LATERAL, TRANSVERSAL, TRANSVERSAL]).T
     clamped = np.clip(q, lower, upper)
-    total = clamped[..., 1] + clamped[..., 2]
+    total = clamped[..., 1] + clamped[..., 2]  # outer + inner
     clamped[..., 1:] += 0.5 * (np.clip(total, *np.radians(SUM)) - total)[..., None]
     return clamped
 
@@ -268,7 +280,7 @@ def test_nearest_reachable_point_is_within_2_mm_of_a_sampled_search(build, leg):
 
 
 def test_reachable_flag_is_set_where_the_residual_is_below_10_micrometres(build):
-    paws = build.legs_at(random_motors(1000, seed=6))[0]
+    paws = build.legs_at(random_motors(1000, seed=6)).ankle
     far_paws = paws + np.array([0.0, 0.0, -1.0])
     for targets in (paws, far_paws):
         _, _, reachable, residual = build.solve(targets)
@@ -287,12 +299,11 @@ def test_target_below_reach_gives_stretched_leg(build):
 
 def test_every_pose_is_within_limits(build):
     targets = np.random.default_rng(7).uniform(-1.0, 1.0, (4, 500, 3))
-    motors = np.degrees(build.solve(targets)[0].astype(np.float64)).reshape(4, 3, 500)
+    motors, _, _, _ = build.solve(targets)
+    lateral, outer, inner = np.degrees(motors.astype(np.float64)).reshape(4, 3, 500).swapaxes(0, 1)
     slack = 1.0e-4  # [deg]
-    total = motors[:, 1] + motors[:, 2]
-    assert motors[:, 0].min() > LATERAL[0] - slack and motors[:, 0].max() < LATERAL[1] + slack
-    assert motors[:, 1:].min() > TRANSVERSAL[0] - slack and motors[:, 1:].max() < TRANSVERSAL[1] + slack
-    assert total.min() > SUM[0] - slack and total.max() < SUM[1] + slack
+    for angle, (low, high) in ((lateral, LATERAL), (outer, TRANSVERSAL), (inner, TRANSVERSAL), (outer + inner, SUM)):
+        assert angle.min() > low - slack and angle.max() < high + slack
 
 
 @pytest.mark.parametrize("depth", [1.0e3, 1.0e12, 1.0e30])  # [m]
@@ -307,7 +318,7 @@ def test_target_far_below_stretches_the_legs_under_the_hips(build, depth):
 
 def test_non_finite_target_puts_the_ankle_0_3_below_the_axes(build):
     motors = build.solve(np.full((4, 1, 3), math.nan))[0]
-    ankle = build.legs_at(motors)[0][:, 0]
+    ankle = build.legs_at(motors).ankle[:, 0]
     want = [[0.24, 0.1652, -0.3], [0.24, -0.1652, -0.3], [-0.24, 0.2102, -0.3], [-0.24, -0.2102, -0.3]]
     np.testing.assert_allclose(ankle, want, atol=1.0e-6)
 
@@ -338,9 +349,8 @@ def test_inverse_velocity_undoes_the_jacobian(build):
     motors[1::3] = np.abs(motors[1::3])
     motors[2::3] = np.abs(motors[2::3])
     wanted = rng.uniform(-1.0, 1.0, (4, 500, 3))
-    jacobian = build.legs_at(motors)[1]
-    rates = build.legs_at(motors, wanted)[3]
-    reached = np.einsum("lnij,lnj->lni", jacobian, rates)
+    legs = build.legs_at(motors, wanted)
+    reached = np.einsum("lnij,lnj->lni", legs.jacobian, legs.rates)
     np.testing.assert_allclose(reached, wanted, atol=1.0e-12 if build.double else 2.0e-5)  # [m/s]
 
 
@@ -349,9 +359,9 @@ def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
     outer = np.radians(np.linspace(-20.0, 5.0, 2001))
     motors = np.tile([0.0, 0.0, math.radians(25.0)], 4)[:, None] * np.ones((1, 2001))
     motors[1::3] = outer
-    knees = build.legs_at(motors)[2][:, :, 0]
+    knees = build.legs_at(motors).knees[:, :, 0]  # outer
     assert knees.min() < -0.05 and knees.max() > 0.05
-    rates = build.legs_at(motors, np.tile([0.0, 0.0, -1.0], (4, 2001, 1)))[3]
+    rates = build.legs_at(motors, np.tile([0.0, 0.0, -1.0], (4, 2001, 1))).rates
     # at most 1 m/s over the 10 mm of lever at which damping sets in, and nothing in the straight pose itself
     assert np.isfinite(rates).all() and np.abs(rates).max() < 101.0
     straight = np.abs(knees).argmin(axis=1)
@@ -359,6 +369,7 @@ def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
 
 
 def test_rates_that_cancel_the_base_twist_hold_the_ankles_still_in_pinocchio(build, robot):
+    """The base moves and turns at random; motor and knee rates for the opposite ankle velocity keep both ends still."""
     tolerance = 1.0e-9 if build.double else 5.0e-5  # [m/s]
     rng = np.random.default_rng(9)
     n = 50
@@ -366,8 +377,8 @@ def test_rates_that_cancel_the_base_twist_hold_the_ankles_still_in_pinocchio(bui
     lin, ang = rng.uniform(-1.0, 1.0, (2, n, 3))
     motors = np.radians(rng.uniform(10.0, 100.0, (12, n)))
     to_body = Rotation.from_quat(base_quat).inv()
-    rigid_velocity = to_body.apply(lin) + np.cross(to_body.apply(ang), build.legs_at(motors)[0])  # of ankles, body axes
-    rates, knee_rates = build.legs_at(motors, -rigid_velocity)[3:]
+    rigid_velocity = to_body.apply(lin) + np.cross(to_body.apply(ang), build.legs_at(motors).ankle)  # [m/s], body axes
+    _, _, _, rates, knee_rates = build.legs_at(motors, -rigid_velocity)
     for i in range(n):
         q = robot.configuration(base_pos[i], base_quat[i], motors[:, i])
         v = np.zeros(robot.model.nv)

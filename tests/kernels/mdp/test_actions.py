@@ -5,6 +5,7 @@ import pytest
 import torch
 import warp as wp
 
+from columns import LIN_VEL, MOTOR_COORDS, MOTOR_DOFS
 from jump_helpers import make_env, only, random_actions
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp.actions import action_kernel
@@ -14,9 +15,8 @@ from jumper_warp.kernels.mdp.reset import advance_rng_kernel
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import LimitsCfg, vertical_jump_filter
 from jumper_warp.tasks.randomization import RandomizationCfg
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, no_delays, standing_robots
+from mdp_helpers import DEFAULT_ANGLE, STEP_DT, SUBSTEPS, array, new_worlds, no_delays, standing_robots
 from probe_task import probe_task
-from solver_helpers import MOTOR_Q, MOTOR_V
 
 DEG = np.pi / 180.0
 SCALE = np.tile([15.0, 90.0, 90.0], 4) * DEG
@@ -84,7 +84,7 @@ def test_rates_torques_and_base_velocity_are_stored_as_previous_ones():
     commands = Commands(32)
     rates, torque = random_action(32, seed=3), random_action(32, seed=4)
     qd = np.zeros((32, 38), dtype=np.float32)
-    qd[:, 6 + MOTOR_SLOTS], qd[:, :3] = rates, [1.0, 2.0, 3.0]
+    qd[:, MOTOR_DOFS], qd[:, LIN_VEL] = rates, [1.0, 2.0, 3.0]
     commands.robot.joint_qd.assign(qd.ravel())
     commands.robot.torque.assign(torque.T)
     commands.act(np.zeros((32, 12)))
@@ -164,7 +164,7 @@ def test_simulated_motors_follow_delayed_targets():
     for each in (env, oracle):  # contact iterations from different initial guesses differ by the tolerance
         each.sim.physics.solver.tolerance = 1.0e-6
     physics, past = oracle.sim.physics, []
-    initial = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
+    initial = env.sim.joint_q()[:, MOTOR_COORDS]
     target = wp.zeros((12, len(delays)), dtype=float, device="cpu")
     for action in 0.3 * random_actions(len(delays), 12, seed=1):
         env.step(action)
@@ -175,7 +175,7 @@ def test_simulated_motors_follow_delayed_targets():
             target.assign(np.array(targets).T)
             physics.advance(1, target)
         assert not env.done.any()
-        motors, rates = [*range(7), *MOTOR_Q], [*range(6), *MOTOR_V]  # base and motors; knees are not written
+        motors, rates = [*range(7), *MOTOR_COORDS], [*range(6), *MOTOR_DOFS]  # base and motors; knees are not written
         np.testing.assert_allclose(env.sim.joint_q()[:, motors], oracle.sim.joint_q()[:, motors], atol=1e-5)  # [rad]
         np.testing.assert_allclose(env.sim.joint_qd()[:, rates], oracle.sim.joint_qd()[:, rates], atol=0.01)  # [rad/s]
     assert np.abs(env.sim.joint_qd()[1:] - env.sim.joint_qd()[:1]).max() > 0.1

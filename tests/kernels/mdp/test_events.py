@@ -182,7 +182,7 @@ def test_an_interval_event_shorter_than_a_policy_step_runs_in_every_step():
 
 
 def test_samples_of_events_depend_on_seed_and_step_count():
-    def sampled_forces(only, seed=0, steps=0):
+    def sampled_forces(only, seed=0, steps=0):  # (worlds,) pushes sampled by a reset after `steps` policy steps
         events = Events(only, seed)
         for _ in range(steps):
             events.next_clock()

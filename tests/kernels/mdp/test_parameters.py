@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 from scipy.stats import kstest
 
+from columns import MOTOR_DOFS
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.kernels.mdp.parameters import RobotParameters
@@ -13,7 +14,7 @@ from jumper_warp.kernels.mdp.random import make_stream
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
-from mdp_helpers import MOTOR_SLOTS, array
+from mdp_helpers import array
 
 N = 512
 NAMES = """base_mass link_mass com_shift armature motor_friction gains speed_limits joint_offset friction action_latency
@@ -171,7 +172,7 @@ def test_kp_and_kd_have_separate_ranges(robots, run_event):
 def test_only_armatures_of_motors_are_scaled(robots, run_event):
     sample = run_event("armature", 0.6, 1.4, only=("joint_armature",))
     before, after = dofs(robots.nominal["joint_armature"]), dofs(sample.joint_armature)
-    motors = 6 + MOTOR_SLOTS
+    motors = MOTOR_DOFS
     scale = after[:, motors] / before[:, motors]
     assert is_uniform(scale, 0.6, 1.4) and is_uncorrelated(scale)
     others = np.setdiff1d(np.arange(38), motors)
@@ -180,7 +181,7 @@ def test_only_armatures_of_motors_are_scaled(robots, run_event):
 
 def test_only_motors_have_friction(robots, run_event):
     sample = run_event("motor_friction", 0.005, 0.04, only=("joint_friction",))
-    motors = 6 + MOTOR_SLOTS
+    motors = MOTOR_DOFS
     values = dofs(sample.joint_friction)
     assert is_uniform(values[:, motors], 0.005, 0.04) and is_uncorrelated(values[:, motors])
     others = np.setdiff1d(np.arange(38), motors)

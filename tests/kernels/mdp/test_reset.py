@@ -6,13 +6,14 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
+from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, QUAT, XY, Z
 from jumper_warp.kernels.mdp.env import BEGUN, COMMANDED, Delays, EpisodeArrays, Scene, SkillSettings
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel, default_pose_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.simulation import Simulation
-from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, array, values_of, write
+from mdp_helpers import DEFAULT_ANGLE, array, values_of, write
 from probe_task import Probe, probe_task
 
 N = 96
@@ -66,8 +67,8 @@ class Stage(Probe):
                 if isinstance(values, wp.array) and name not in ("body_com", "gravity", "default_angle"):
                     values.assign(rng.uniform(1.0, 9.0, values.numpy().shape))
         q = self.robot.joint_q.numpy().reshape(self.n, 43).copy()
-        q[:, 3:7] = Rotation.random(self.n, random_state=seed).as_quat()
-        q[:, 7 + MOTOR_SLOTS] = DEFAULT_ANGLE + rng.uniform(-0.2, 0.2, (self.n, 12))
+        q[:, QUAT] = Rotation.random(self.n, random_state=seed).as_quat()
+        q[:, MOTOR_COORDS] = DEFAULT_ANGLE + rng.uniform(-0.2, 0.2, (self.n, 12))
         self.robot.joint_q.assign(q.ravel())
         self.robot.body_com.assign(np.tile([0.01, -0.02, 0.03], (21 * self.n, 1)))
 
@@ -117,8 +118,8 @@ def test_a_reset_begins_episodes_in_masked_worlds_and_changes_no_other(stage):
     q = after.joint_q.reshape(N, 43)[MASK]
     reference = stage.scene.reference_q.numpy().reshape(N, 43)[MASK]
     np.testing.assert_array_equal(q[:, 7:], reference[:, 7:])
-    np.testing.assert_allclose(q[:, 2], reference[:, 2] + 0.25, atol=1e-6)
-    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX"), np.tile([0.5, 0, 0], (MASK.sum(), 1)),
+    np.testing.assert_allclose(q[:, Z], reference[:, 2] + 0.25, atol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(q[:, QUAT]).as_euler("ZYX"), np.tile([0.5, 0, 0], (MASK.sum(), 1)),
                                atol=1e-6)  # fmt: skip
     assert not after.joint_qd.reshape(N, 38)[MASK].any()
 
@@ -135,7 +136,7 @@ def test_worlds_of_another_skill_get_neither_resets_nor_commands(stage):
 
 
 def test_samples_of_a_reset_depend_on_seed_and_step_count():
-    def draws(seed=0, later=0):
+    def draws(seed=0, later=0):  # values sampled by a reset of all worlds, `later` policy steps after the first
         stage = Stage(seed=seed)
         stage.episodes.step_count.assign(stage.episodes.step_count.numpy() + later)
         stage.reset(1.0)
@@ -216,7 +217,7 @@ def test_a_host_command_begins_an_episode_with_its_heading(stage):
 def test_a_host_command_within_an_episode_uses_the_robots_yaw(stage):
     stage.scramble()
     stage.write(value=1.5, steps=9, other=3.0)
-    ahead = Rotation.from_quat(stage.robot.joint_q.numpy().reshape(N, 43)[:, 3:7]).apply([1.0, 0.0, 0.0])
+    ahead = Rotation.from_quat(stage.robot.joint_q.numpy().reshape(N, 43)[:, QUAT]).apply([1.0, 0.0, 0.0])
     stage.set_command(MASK, 0, np.full((N, 4), 4.25), np.full(N, 99.0))
     np.testing.assert_array_equal(stage.read("value"), np.where(MASK, 4.25, 1.5))
     expected = np.where(MASK, np.arctan2(ahead[:, 1], ahead[:, 0]), 3.0)
@@ -248,9 +249,9 @@ def test_default_pose_has_its_heading_on_top_of_the_block_which_returns_to_its_s
     q = after.joint_q.reshape(N, 43)[MASK]
     reference = stage.scene.reference_q.numpy().reshape(N, 43)[MASK]
     np.testing.assert_array_equal(q[:, 7:], reference[:, 7:])
-    np.testing.assert_allclose(q[:, :2], reference[:, :2])
-    np.testing.assert_allclose(q[:, 2], reference[:, 2] + records["height"][0], atol=1e-6)
-    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX")[:, 0], headings[MASK], atol=1e-6)
+    np.testing.assert_allclose(q[:, XY], reference[:, :2])
+    np.testing.assert_allclose(q[:, Z], reference[:, 2] + records["height"][0], atol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(q[:, QUAT]).as_euler("ZYX")[:, 0], headings[MASK], atol=1e-6)
     assert not after.joint_qd.reshape(N, 38)[MASK].any()
     center = stage.scene.ground.blocks.numpy()["center"]
     np.testing.assert_array_equal(center, np.where(MASK[:, None], records["start"], [3.0, 4.0]))
@@ -285,14 +286,16 @@ def test_clear_history_sets_arrays_to_0_or_the_present_state(stage):
         assert not by_world(getattr(robot, name))[MASK].any(), name
         assert by_world(getattr(robot, name))[~MASK].all(), name
     q, qd = robot.joint_q.reshape(N, 43), robot.joint_qd.reshape(N, 38)
-    angles = q[:, 7 + MOTOR_SLOTS][MASK]
+    angles = q[:, MOTOR_COORDS][MASK]
     for name in ("target", "filtered_target"):
         np.testing.assert_array_equal(by_world(getattr(robot, name))[MASK], angles, name)
-    np.testing.assert_array_equal(by_world(robot.prev_rate)[MASK], qd[:, 6 + MOTOR_SLOTS][MASK])
+    np.testing.assert_array_equal(by_world(robot.prev_rate)[MASK], qd[:, MOTOR_DOFS][MASK])
     past = stage.delays.target_history.numpy()
     np.testing.assert_array_equal(past[:, :, MASK], np.tile(angles.T, (8, 1, 1)))
-    com = Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03])  # [m] of `scramble`, world axes
-    np.testing.assert_allclose(robot.prev_lin_vel[MASK], (qd[:, :3] - np.cross(qd[:, 3:6], com))[MASK], atol=1e-5)
+    com = Rotation.from_quat(q[:, QUAT]).apply([0.01, -0.02, 0.03])  # [m] of `scramble`, world axes
+    np.testing.assert_allclose(
+        robot.prev_lin_vel[MASK], (qd[:, LIN_VEL] - np.cross(qd[:, ANG_VEL], com))[MASK], atol=1e-5
+    )
 
 
 def test_clear_history_writes_paw_positions_and_velocities_of_the_present_state():
@@ -311,5 +314,5 @@ def test_clear_history_writes_paw_positions_and_velocities_of_the_present_state(
 def test_clear_history_fills_the_target_history_with_motor_angles(stage):
     write(stage.delays.target_history, slice(None), 9.0)
     stage.clear_history(1.0)
-    angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, 7 + MOTOR_SLOTS]
+    angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, MOTOR_COORDS]
     assert (stage.delays.target_history.numpy() == angles.T).all()

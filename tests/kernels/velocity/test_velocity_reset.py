@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from columns import ANG_VEL, MOTOR_COORDS, QUAT, XY, Z
 from jump_starts import PAW_RADIUS, collision_flags, paws_and_velocities
 from jumper_warp.registry import make_task
 from mdp_helpers import DEFAULT_ANGLE
-from solver_helpers import MOTOR_Q
 from velocity_helpers import edit, states_of, walking_env
 
 N = 1024
@@ -42,17 +42,17 @@ def test_base_poses_cover_their_ranges_or_are_the_default_pose(begun):
     drawn = moving_starts(q, qd)
     assert 0.80 < drawn.mean() < 0.92  # default pose: probability 0.1, or no attempt valid
     assert 0.30 < q[drawn, 2].min() < 0.31 and q[drawn, 2].max() < 0.50
-    assert np.abs(q[:, :2]).max() <= 0.1
-    turn = Rotation.from_quat(q[:, 3:7]).as_euler("ZYX", degrees=True)
+    assert np.abs(q[:, XY]).max() <= 0.1
+    turn = Rotation.from_quat(q[:, QUAT]).as_euler("ZYX", degrees=True)
     assert np.abs(turn[drawn, 1:]).max() < 5.0 + 1e-3 and np.abs(turn[drawn, 1:]).max() > 4.5
     assert np.histogram(turn[:, 0], 8, (-180.0, 180.0))[0].min() > 0.08 * N
-    np.testing.assert_allclose(q[~drawn][:, MOTOR_Q] - DEFAULT_ANGLE, 0.0, atol=1e-5)
+    np.testing.assert_allclose(q[~drawn][:, MOTOR_COORDS] - DEFAULT_ANGLE, 0.0, atol=1e-5)
 
 
 def test_paws_are_on_the_ground_or_in_the_air_with_swing_probability(begun):
     env, q, qd = begun
     paws, _ = paws_and_velocities(env, np.flatnonzero(moving_starts(q, qd)))
-    above = paws[..., 2] - PAW_RADIUS
+    above = paws[..., Z] - PAW_RADIUS
     down = np.abs(above) < 2e-4
     assert (down | ((above > 0.0098) & (above < 0.1002))).all()
     assert 0.62 < down.mean() < 0.78  # 0.7 of samples, changed a little by rejections
@@ -62,41 +62,43 @@ def test_paws_on_the_ground_are_at_rest_while_bases_turn(begun):
     env, q, qd = begun
     drawn = moving_starts(q, qd)
     paws, velocities = paws_and_velocities(env, np.flatnonzero(drawn))
-    down = np.abs(paws[..., 2] - PAW_RADIUS) < 2e-4
+    down = np.abs(paws[..., Z] - PAW_RADIUS) < 2e-4
     speed = np.linalg.norm(velocities, axis=2)
     # [m/s] except near-singular legs, whose inverse Jacobian is damped
     assert np.quantile(speed[down], 0.99) < 1e-4 and speed[down].max() < 0.1 and np.median(speed[~down]) > 0.1
-    assert np.abs(qd[drawn, 3:6]).max() > 0.4
+    assert np.abs(qd[drawn, ANG_VEL]).max() > 0.4  # [rad/s]
 
 
-def test_no_start_collides(begun):
-    assert not collision_flags(begun[0]).any()
+def test_no_robot_collides_at_its_start(begun):
+    env, _, _ = begun
+    assert not collision_flags(env).any()
 
 
 def test_first_commands_have_their_kinds_limits_and_durations(begun):
     env, _, _ = begun
     state = states_of(env)
     command, standing = state["command"], state["standing"] == 1
-    assert 0.08 < standing.mean() < 0.17 and not command[standing].any()
-    turning = ~standing & ~command[:, :2].any(axis=1)
-    assert 0.02 < turning.mean() < 0.09
-    walking = command[~standing & ~turning]
+    assert 0.08 < standing.mean() < 0.17 and not command[standing].any()  # 12 % stand
+    turning = ~standing & ~command[:, XY].any(axis=1)
+    assert 0.02 < turning.mean() < 0.09  # 5 % turn on the spot
+    walking = command[~standing & ~turning]  # [m/s], [m/s], [rad/s], each within ±0.8
     assert np.abs(walking).max() <= 0.8 and np.abs(walking).max(axis=0).min() > 0.75
-    assert state["command_lasts"].min() >= 119 and state["command_lasts"].max() <= 360
+    assert state["command_lasts"].min() >= 119 and state["command_lasts"].max() <= 360  # policy steps: 2 to 6 s
 
 
 def test_commands_of_the_last_level_shrink_sideways_with_the_speed_ahead(env):
     edit(env, command_level=10, steps=0)
     env.reset()
     command = states_of(env)["command"]
-    ahead, back, aside, turning = TASK.levels[0].last_range
-    assert 0.9 * ahead < command[:, 0].max() <= ahead and command[:, 0].min() >= -back
-    assert 0.85 * aside < np.abs(command[:, 1]).max() <= aside
-    assert 0.85 * turning < np.abs(command[:, 2]).max() <= turning
-    fast = command[:, 0] > 0.7 * ahead
+    ahead, back, aside, turning = TASK.levels[0].last_range  # [m/s], [m/s], [m/s], [rad/s]
+    x, y, yaw = command.T
+    assert 0.9 * ahead < x.max() <= ahead and x.min() >= -back
+    assert 0.85 * aside < np.abs(y).max() <= aside
+    assert 0.85 * turning < np.abs(yaw).max() <= turning
+    fast = x > 0.7 * ahead
     assert fast.sum() > 40
-    shrink = np.sqrt(np.maximum(1.0 - (command[fast, 0] / ahead) ** 2, 0.04))
-    assert (np.abs(command[fast, 1]) <= aside * shrink + 1e-5).all()
+    shrink = np.sqrt(np.maximum(1.0 - (x[fast] / ahead) ** 2, 0.04))  # an ellipse, at least 0.2 of its width
+    assert (np.abs(y[fast]) <= aside * shrink + 1e-5).all()
 
 
 @pytest.mark.parametrize(
@@ -108,7 +110,7 @@ def test_commands_of_the_last_level_shrink_sideways_with_the_speed_ahead(env):
 )  # fmt: skip
 def test_a_full_accurate_episode_raises_the_level_and_a_fall_lowers_it(env, fields, ended, level, falls):
     q = env.sim.joint_q().copy()
-    q[:, :2] = 0.05
+    q[:, XY] = 0.05
     env.sim.state.joint_q.assign(q.ravel())
     edit(env, command_level=3, falls=0.0, limit=(0.0, 0.0))
     edit(env, **fields)

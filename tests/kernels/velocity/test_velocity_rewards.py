@@ -1,13 +1,15 @@
 """Rewards of velocity tracking against NumPy formulas, on random robots."""
 
 import inspect
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import warp as wp
 
+from columns import XY
 from jump_helpers import Table, functions, make_view
-from jumper_warp.kernels.mdp.view import mat43, vec12
+from jumper_warp.kernels.mdp.view import RobotView, mat43, vec12
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.tasks.velocity.flat import velocity_trot
@@ -31,8 +33,16 @@ def make_state(**fields) -> VelocityState:
     return state
 
 
+class Sample(NamedTuple):
+    """A random robot, as NumPy and as Warp structs."""
+
+    fields: dict  # of view and state, by name
+    view: RobotView
+    state: VelocityState
+
+
 def robots(seed: int = 3):
-    """Return N random (fields of view and state by name as NumPy, `RobotView`, `VelocityState`)."""
+    """Return N random `Sample`s."""
     rng = np.random.default_rng(seed)
     samples = []
     for _ in range(N):
@@ -54,7 +64,7 @@ def robots(seed: int = 3):
         struct = make_view(**view)
         struct.paw_vel = mat43(*paw_vel.ravel())
         vel = np.array(wp.quat_rotate_inv(quat, wp.vec3(*view["lin_vel"])))
-        samples.append((view | state | {"vel": vel, "paw_vel": paw_vel}, struct, make_state(**state)))
+        samples.append(Sample(view | state | {"vel": vel, "paw_vel": paw_vel}, struct, make_state(**state)))
     return samples
 
 
@@ -62,19 +72,25 @@ ROBOTS = robots()
 
 
 def trot(r, duty):
-    """Return the NumPy value of `trot_schedule`; r: fields of `robots`, as in all functions below."""
+    """Return the share of paws whose contact is that of a trot at `duty`, 0 if standing; r: `Sample.fields`, as below.
+
+    Legs are FL, FR, BL, BR; FR and BL are half a gait cycle ahead; a paw is scheduled down while its phase < duty.
+    """
     phase = np.mod(r["phase"] + np.array([0.0, 0.5, 0.5, 0.0]), 1.0)
     return np.mean((phase < duty) == (r["contact"] > 0.5)) * (1 - r["standing"])
 
 
 def clearance(r, height):
-    """Return the NumPy value of `foot_clearance`; height [m]."""
-    speed = np.linalg.norm(r["paw_vel"][:, :2], axis=1)
+    """Return the sum over swinging paws of the squared error to `height` [m] times the horizontal speed [m/s]."""
+    speed = np.linalg.norm(r["paw_vel"][:, XY], axis=1)
     return np.sum((1.0 - r["contact"]) * (r["paw_height"] - height) ** 2 * speed)
 
 
 def shank_lean(r, threshold, hip, thigh, shank):
-    """Return the NumPy value of `shank_lean`: ankles are the lower intersections of circles around the knees."""
+    """Return the sum over shanks of legs on the ground of (lean - threshold)^2 [rad^2] where they lean more than that.
+
+    Ankles are the lower intersections of circles around the knees; lean is the angle off the vertical.
+    """
     down, total = r["projected_gravity"][[0, 2]] / np.linalg.norm(r["projected_gravity"][[0, 2]]), 0.0
     for leg, contact in enumerate(r["contact"]):
         front = 1.0 if leg < 2 else -1.0
@@ -93,8 +109,14 @@ def shank_lean(r, threshold, hip, thigh, shank):
 
 
 LEG = {"threshold": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}  # [rad], [m], [m], [m]
-OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
-EXPECTED = {
+
+
+def offset(r):
+    """Return the motors' angles [rad] (12,) less those of the default pose."""
+    return r["angle"] - DEFAULT_ANGLE
+
+
+EXPECTED = {  # name of a reward: its numbers, and its value for the fields of a `Sample`
     "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
     "yaw_rate": ({"std": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
     "lin_vel_z_l2": ({}, lambda r: r["vel"][2] ** 2),
@@ -102,15 +124,15 @@ EXPECTED = {
     "flat_orientation_l2": ({}, lambda r: np.sum(r["projected_gravity"][:2] ** 2)),
     "standing_posture": (
         {"std": 0.5, "shift": 0.2},
-        lambda r: np.exp(-np.mean((OFF["angle"](r)[TRANSVERSAL] - 0.2) ** 2) / 0.25) * r["standing"],
+        lambda r: np.exp(-np.mean((offset(r)[TRANSVERSAL] - 0.2) ** 2) / 0.25) * r["standing"],
     ),
     "lateral_position": (
         {"steepness": 100.0},
-        lambda r: np.sum(np.exp(-100.0 * OFF["angle"](r)[~TRANSVERSAL] ** 8) - 1.0),
+        lambda r: np.sum(np.exp(-100.0 * offset(r)[~TRANSVERSAL] ** 8) - 1.0),
     ),
     "transversal_position": (
         {"steepness": 50.0, "shift": 0.2},
-        lambda r: np.sum(np.exp(-50.0 * (OFF["angle"](r)[TRANSVERSAL] - 0.2) ** 20) - 1.0),
+        lambda r: np.sum(np.exp(-50.0 * (offset(r)[TRANSVERSAL] - 0.2) ** 20) - 1.0),
     ),
     "air_time": (
         {"threshold": 0.25},
@@ -123,7 +145,7 @@ EXPECTED = {
     ),
     "restless_stand": ({}, lambda r: np.sum(1.0 - r["contact"]) * r["standing"]),
     "foot_clearance": ({"target_height": 0.07}, lambda r: clearance(r, 0.07)),
-    "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
+    "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, XY] ** 2, axis=1))),
     "touchdown": ({}, lambda r: np.sum(r["first_contact"] * r["touchdown_speed"] ** 2)),
     "torque_sign_changes": ({}, lambda r: np.sum(np.sign(r["torque"]) != np.sign(r["prev_torque"]))),
     "shank_lean": (LEG, lambda r: shank_lean(r, **LEG)),
@@ -134,8 +156,8 @@ EXPECTED = {
 @pytest.mark.parametrize("name", NAMES.split())
 def test_reward_equals_its_numpy_formula(name):
     numbers, expected = EXPECTED[name]
-    values = reward.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
-    expected_values = [expected(fields) for fields, _, _ in ROBOTS]
+    values = reward.all(name, [robot.view for robot in ROBOTS], [robot.state for robot in ROBOTS], **numbers)
+    expected_values = [expected(robot.fields) for robot in ROBOTS]
     np.testing.assert_allclose(values, expected_values, rtol=2e-4, atol=2e-6)
     assert np.ptp(expected_values) > 1e-3
 

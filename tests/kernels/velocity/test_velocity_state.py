@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from columns import XY
 from jump_helpers import make_view
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.kernels.velocity.state import VelocityState, advance_velocity
@@ -36,14 +37,15 @@ def histories():
 
 
 COMMAND = np.array([0.5, -0.3, 0.7])  # [m/s], [m/s], [rad/s]
+PACE = 0.03  # gait cycles per policy step
 
 
 @pytest.fixture(scope="module")
 def followed():
-    """Return histories and the fields of the states after them; world 3 is commanded to stand."""
+    """Return `histories` and the fields of the states after them by name; world 3 is commanded to stand."""
     h = histories()
-    h["lin_vel"][50, 1, 0] = np.nan  # diverged worlds
-    h["ang_vel"][60, 2, 2] = 1e6
+    h["lin_vel"][50, 1, 0] = np.nan  # step 50 of world 1; worlds that diverged are not counted
+    h["ang_vel"][60, 2, 2] = 1e6  # [rad/s] step 60 of world 2
     views = [
         [
             make_view(
@@ -56,7 +58,7 @@ def followed():
     ]  # fmt: skip
     states = [VelocityState() for _ in range(WORLDS)]
     for world, state in enumerate(states):
-        state.command, state.pace, state.terrain_level = wp.vec3(*COMMAND), 0.03, 2
+        state.command, state.pace, state.terrain_level = wp.vec3(*COMMAND), PACE, 2
         state.standing = int(world == 3)
     array = wp.array(states, dtype=VelocityState, device="cpu")
     flat = wp.array([view for row in views for view in row], dtype=RobotView, device="cpu")
@@ -66,6 +68,7 @@ def followed():
 
 
 def test_recent_steps_counts_touchdowns_of_the_last_45_policy_steps(followed):
+    """The count is by paw; some paw touched down in the 46th step from the end, which no longer counts."""
     h, state = followed
     np.testing.assert_array_equal(state["recent_steps"], h["first"][-45:].sum(axis=0))
     assert state["recent_steps"].min() > 3 and (h["first"][-46] & ~h["first"][-45]).any()
@@ -73,7 +76,7 @@ def test_recent_steps_counts_touchdowns_of_the_last_45_policy_steps(followed):
 
 def test_errors_and_score_sum_over_settled_finite_policy_steps(followed):
     h, state = followed
-    error = np.concatenate([h["lin_vel"][..., :2], h["ang_vel"][..., 2:]], axis=2) - COMMAND
+    error = np.concatenate([h["lin_vel"][..., XY], h["ang_vel"][..., 2:]], axis=2) - COMMAND
     xy, yaw = np.linalg.norm(error[..., :2], axis=2)[SETTLE:], np.abs(error[..., 2])[SETTLE:]
     fine = (xy < 40.0) & (yaw < 40.0)  # [m/s], [rad/s] MAX_COUNTED_ERROR
     assert (~fine).sum() == 2
@@ -83,7 +86,7 @@ def test_errors_and_score_sum_over_settled_finite_policy_steps(followed):
     for total in ("error_yaw", "sum_yaw"):
         np.testing.assert_allclose(state[total], yaw.sum(axis=0), rtol=1e-5)
     np.testing.assert_array_equal(state["settled"], fine.sum(axis=0))
-    speed = np.hypot(0.5, 0.3) + 0.3 * 0.7
+    speed = np.hypot(0.5, 0.3) + 0.3 * 0.7  # of COMMAND, with yaw weighted by 0.3 m
     score = 1.2 * np.where(fine, speed - 2.0 * (xy + 0.3 * yaw), 0.0).sum(axis=0)  # 1.2: terrain level 2
     np.testing.assert_allclose(state["score"], score, rtol=1e-4)
 
@@ -92,18 +95,18 @@ def test_times_and_gait_phase_advance_with_every_policy_step(followed):
     _, state = followed
     assert set(state["steps"]) == set(state["command_steps"]) == {STEPS} and set(state["all_steps"]) == {STEPS}
     np.testing.assert_allclose(state["minutes"], STEPS * DT / 60.0, rtol=1e-5)
-    np.testing.assert_allclose(state["phase"], (0.03 * STEPS) % 1.0, atol=1e-4)
+    np.testing.assert_allclose(state["phase"], (PACE * STEPS) % 1.0, atol=1e-4)
     np.testing.assert_allclose(state["seconds_walking"], np.where(np.arange(WORLDS) == 3, 0.0, STEPS * DT), rtol=1e-5)
 
 
 def test_swing_heights_and_their_sums_at_touchdowns_match_numpy(followed):
     h, state = followed
-    apex, steps, high = np.zeros(WORLDS), np.zeros(WORLDS), np.zeros((WORLDS, 4))
+    apexes, touchdowns, high = np.zeros(WORLDS), np.zeros(WORLDS), np.zeros((WORLDS, 4))  # high: of the swing so far
     for down, first, height in zip(h["down"], h["first"], h["height"], strict=True):
-        apex += 0.25 * (first * high).sum(axis=1)
-        steps += 0.25 * first.sum(axis=1)
+        apexes += (first * high).mean(axis=1)  # means over paws
+        touchdowns += first.mean(axis=1)
         high = np.where(down, 0.0, np.maximum(high, height))
-    moving = np.arange(WORLDS) != 3
+    moving = np.arange(WORLDS) != 3  # world 3 is commanded to stand
     np.testing.assert_allclose(state["swing_height"], high, rtol=1e-6)
-    np.testing.assert_allclose(state["apexes"], apex * moving, rtol=1e-5)
-    np.testing.assert_allclose(state["touchdowns"], steps * moving, rtol=1e-6)
+    np.testing.assert_allclose(state["apexes"], apexes * moving, rtol=1e-5)
+    np.testing.assert_allclose(state["touchdowns"], touchdowns * moving, rtol=1e-6)
