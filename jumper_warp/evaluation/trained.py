@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import EvaluationLog, within
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.metrics import Metrics, rate
 
 TOLERANCE = 1.0e-6  # [m], [m/s], [rad/s] Distance from a range that counts as rounding
 
@@ -66,6 +69,25 @@ def beyond_training(task: TaskCfg, commands: np.ndarray) -> list[str]:
         if excess.max(initial=0.0) > TOLERANCE:
             words.append(f"{name} {values[excess.argmax()]:g} {unit} (trained {low:g} to {high:g})")
     return words
+
+
+def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
+    """Return the success rates of jumps with first goals within and beyond the training, if there are both.
+
+    Keys: `within_training_success_rate`, `beyond_training_success_rate`.
+    """
+    bounds = trained_bounds(task)
+    if not isinstance(log, JumpLog) or not bounds:
+        return {}
+    goals = log.goals[:, 0]
+    inside = np.all([within(goals[:, bound.index], (bound.low, bound.high)) for bound in bounds], axis=0)
+    if inside.all() or not inside.any():
+        return {}
+    success, ranges = log.success[:, 0], " × ".join(f"{bound.low:g} to {bound.high:g}" for bound in bounds)
+    return {
+        "within_training_success_rate": rate(success[inside], f"jumps with goals of trained {ranges} m"),
+        "beyond_training_success_rate": rate(success[~inside], "jumps beyond training"),
+    }
 
 
 def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:

@@ -151,7 +151,8 @@ def test_identical_episodes_are_one_trial(policy, tmp_path, capsys):
     metrics, goals = goals_of(policy, tmp_path / "a", "--command", "0.5")
     assert goals is None and metrics["length_mean_s"].trials == metrics["success_termination_rate"].trials == 1
     printed = capsys.readouterr()
-    assert "all 4 episodes are identical" in printed.err and "1 episode, " in " ".join(printed.out.split())
+    out = " ".join(printed.out.split())
+    assert "all 4 episodes are identical" in printed.err and "1 episode, " in out and "ended by time limit 100 %" in out
     assert goals_of(policy, tmp_path / "b", "--command", "0.5", "--randomize")[0]["length_mean_s"].trials == 4
     assert "identical" not in capsys.readouterr().err
 
