@@ -93,6 +93,7 @@ def _words(key: str, metric: MetricValue) -> str:
     """Return a metric's name in words, such as "apex error, mean size"; metrics of a range of goals name the range."""
     name = split_unit(key)[0].removeprefix(IN_RANGE).replace("_", " ")
     name = re.sub(r"( abs)? (mean|max|median)$", lambda found: f", {found[2]}" + " size" * bool(found[1]), name)
+    name = re.sub(r"^command (\d)$", r"command value \1, in the task's unit", name)
     goals = re.sub(r"^jumps (with goals of )?", "", metric.over or "")
     name = re.sub(r"^ended by (.*) rate$", r"ended by \1", name).replace("by no end", f"by {TIME_LIMIT}")
     name, training = re.subn(r"^(within|beyond) training ", "", name)
