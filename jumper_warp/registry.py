@@ -249,6 +249,11 @@ def task_name(name: str) -> str | None:
     return (installed | _tasks_by_name()).get(dashed(name))
 
 
+def of_project(name: str) -> bool:
+    """Return whether a task, by its registered name, is one of the project's own, not of a user."""
+    return name in TASKS and TASKS[name].origin.startswith("jumper_warp.")
+
+
 def find_task(name: str) -> tuple[str, TaskEntry]:
     """Return (name, entry) of a task by name or alias, where - counts as _; an installed task is loaded.
 

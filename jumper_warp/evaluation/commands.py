@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 import tyro
 
 from jumper_warp.evaluation.scripts import read_script
-from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.catalog import find_policy, is_run_folder
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
@@ -142,22 +142,30 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """
     from jumper_warp.evaluation.log import run_evaluation
     from jumper_warp.evaluation.recorder import EnvRecorder
-    from jumper_warp.evaluation.trained import warn_beyond_training
+    from jumper_warp.evaluation.trained import warn_beyond_resets, warn_beyond_training
 
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
     warn_beyond_training(run.task, log.all_commands())
     env, worlds = run.env(log.count), range(log.count)
-    notes = {"task": name, "solver": cfg.conditions.solver}
+    notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, log, worlds, notes=notes)
     seconds, stop = cfg.seconds or flags.length, cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
     columns = log.columns()
+    if any(key.startswith("command_") for key in columns):
+        warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})
     write_metrics(run.folder, columns)
     count = len(next(iter(columns.values())))
     words = f"{count} {log.row_name}{'s' * (count > 1)}"
     return show_recording(run, recorder.recording(), log.row_name, cfg, words, log.main_columns or columns)
+
+
+def played_name(source: str | Path) -> str:
+    """Return the name of a policy, or of a run or checkpoint as in `logs/TASK/RUN`, for titles."""
+    folder = Path(source).parent.parent if Path(source).suffix == ".pt" else Path(source)
+    return f"run {folder.resolve().name}" if is_run_folder(folder) else folder.resolve().name
 
 
 @dataclass(frozen=True)

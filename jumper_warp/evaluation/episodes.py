@@ -57,7 +57,7 @@ class EpisodeLog(EvaluationLog):
         arrays = env.task_arrays()
         self.start_position = arrays["base_pos"].copy()
         self._compare(arrays)
-        if not self.commands.shape[1]:
+        if self.count == 1 or not self.commands.shape[1]:
             self._start = sampled_numbers(arrays)
 
     def _compare(self, arrays: dict[str, np.ndarray]) -> None:
@@ -98,7 +98,7 @@ class EpisodeLog(EvaluationLog):
     def columns(self) -> dict[str, list]:
         """Return lists with one value per episode: command_0 ..., length_s, mean_base_height_m, base_x_m ..., end.
 
-        Without commands, start_<field> is each number of the task's state that the reset sampled.
+        Without commands or of a single robot, start_<field> is each number of the task's state that the reset sampled.
         """
         columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
@@ -112,6 +112,12 @@ class EpisodeLog(EvaluationLog):
             series[f"height/base, {name} [m]"] = pos[world, 2]
             series[f"distance/from start, {name} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
         return series
+
+    def labels(self, worlds: Sequence[int]) -> list[str]:
+        """Return numbers of some worlds, and their commands: "episode 1, command 0.6 0"."""
+        commands = [" ".join(["", *(f"{value:g}" for value in self.commands[world])]) for world in worlds]
+        pairs = zip(super().labels(worlds), commands, strict=True)
+        return [f"{name}, command{command}" if command else name for name, command in pairs]
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some worlds: key `commands`, a list of rows."""
@@ -134,11 +140,12 @@ def rows_are_equal(values: np.ndarray) -> bool:
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the real numbers of a task's state that differ between worlds, as columns start_<field>, also with _<i>.
 
-    arrays: of `Env.task_arrays`.
+    Of a single world, those that are not 0. arrays: of `Env.task_arrays`.
     """
     columns = {}
     for name, values in arrays.items():
-        if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or rows_are_equal(values):
+        constant = rows_are_equal(values) if len(values) > 1 else not values.any()
+        if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or constant:
             continue
         parts = {f"_{i}": values[:, i] for i in range(values.shape[1])} if values.ndim == 2 else {"": values}
         columns |= {f"start_{name}{end}": part.copy() for end, part in parts.items()}
@@ -177,13 +184,13 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Repeat a command for `count` worlds, padded with zeros to the size n of the task's command: (count, n).
+    """Repeat a command for `count` worlds, padded with zeros to the least size n of the task's command: (count, n).
 
     An empty command stays empty: (count, 0).
     """
     if not command:
         return np.zeros((count, 0))
-    missing = max(layout_of(task).counts[-1] - len(command), 0)
+    missing = max(layout_of(task).counts[0] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
 

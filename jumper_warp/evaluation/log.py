@@ -70,7 +70,7 @@ class EvaluationLog(ABC):
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
         """Return the names of some worlds in recordings and pictures, such as their goals in metres."""
-        return [f"{self.row_name} {world}" for world in worlds]
+        return [f"{self.row_name} {world + 1}" for world in worlds]
 
     def names(self, worlds: Sequence[int]) -> list[str]:
         """Return distinct names of some worlds: their labels, with the world's index if a label is repeated."""

@@ -19,11 +19,12 @@ import tyro
 from jumper_warp.evaluation.evaluations import EvaluationFlags, evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
-from jumper_warp.evaluation.trained import trained_range
+from jumper_warp.evaluation.trained import trained_range, trained_success
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import of_project
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import range_words
@@ -43,11 +44,14 @@ HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of polici
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
 HEADLINES = (
-    "success_rate", "goal_reached_rate", "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "slewed_rmse_vx_m_s",
-    "slewed_rmse_vy_m_s", "slewed_rmse_yaw_rate_rad_s", "settled_without_collision_rate", "settling_time_mean_s",
-    "success_termination_rate", "failure_termination_rate", "length_mean_s", "fall_rate",
+    "success_rate", "within_training_success_rate", "beyond_training_success_rate", "goal_reached_rate",
+    "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "slewed_rmse_vx_m_s", "slewed_rmse_vy_m_s",
+    "slewed_rmse_yaw_rate_rad_s", "settled_without_collision_rate", "settling_time_mean_s",
+    "success_termination_rate", "failure_termination_rate", "ended_by_", "length_mean_s", "no_jump_rate",
+    "at_rest_rate", "no_paw_lift_rate", "second_takeoff_rate", "fall_rate",
 )  # fmt: skip
-"""Keys of the metrics in a summary, unless an evaluation has its own."""
+"""Keys of the metrics in a summary, unless an evaluation has its own; `ended_by_`: all keys that begin with it."""
+MOST_ENDS = 6  # Largest number of terminations in a summary, the most frequent ones
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
 Log = TypeVar("Log", bound=EvaluationLog)
 
@@ -201,6 +205,9 @@ class Run(ABC):
     ) -> dict[str, Any]:  # fmt: skip
         """Write the metrics, print those with the given keys beside the paper's values, and return all values."""
         values = self.write(metrics)
+        ends = [key for key in metrics if key.startswith("ended_by_")]
+        ends = sorted(ends, key=lambda key: metrics[key].value or 0.0, reverse=True)[:MOST_ENDS]  # pyright: ignore
+        keys = [key for name in keys for key in (ends if name == "ended_by_" else [name])]
         printed = [metrics[key] for key in keys if key in metrics]
         most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
         over = most.over.removesuffix("s") if most.over and most.trials == 1 else most.over
@@ -252,7 +259,8 @@ class EvaluationRun(Run):
         self.prepare("evaluate", conditions, out, save_trials=save_trials)
         log = flags.log(self.evaluation.prepare_task(self.task), conditions.stream_seed)
         self.run_episodes(self.env(log.count), log)
-        return self.report(flags.metrics(log), self.evaluation.paper)
+        metrics = flags.metrics(log) | trained_success(self.task, log)
+        return self.report(metrics, self.evaluation.paper if of_project(self.task.name) else {})
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the policy's function from observations to actions, `Policy.act`."""

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import EvaluationLog, within
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.metrics import Metrics, rate
 
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
+
+RESETS = 100  # Number of resets that show the range of a user's command
+MARGIN = 0.1  # Distance from that range, relative to its width, that counts as within: samples rarely reach its ends
 TOLERANCE = 1.0e-6  # [m], [m/s], [rad/s] Distance from a range that counts as rounding
 
 
@@ -68,7 +77,51 @@ def beyond_training(task: TaskCfg, commands: np.ndarray) -> list[str]:
     return words
 
 
+def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
+    """Return the success rates of jumps with first goals within and beyond the training, if there are both.
+
+    Keys: `within_training_success_rate`, `beyond_training_success_rate`.
+    """
+    bounds = trained_bounds(task)
+    if not isinstance(log, JumpLog) or not bounds:
+        return {}
+    goals = log.goals[:, 0]
+    inside = np.all([within(goals[:, bound.index], (bound.low, bound.high)) for bound in bounds], axis=0)
+    if inside.all() or not inside.any():
+        return {}
+    success, ranges = log.success[:, 0], " × ".join(f"{bound.low:g} to {bound.high:g}" for bound in bounds)
+    return {
+        "within_training_success_rate": rate(success[inside], f"jumps with goals of trained {ranges} m"),
+        "beyond_training_success_rate": rate(success[~inside], "jumps beyond training"),
+    }
+
+
 def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
     """Print one line on standard error if commands are beyond the training; arguments: as in `beyond_training`."""
     if commands is not None and (words := beyond_training(task, commands)):
         print(f"jumper: beyond the training of {task.name}: {', '.join(words)}", file=sys.stderr)
+
+
+def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:
+    """Print one line on standard error if numbers of the state at the start are beyond those of resets in training.
+
+    start: columns `start_<field>` of the first episode. Numbers that RESETS resets never vary are skipped.
+    """
+    drawn = []
+    for _ in range(RESETS):
+        env.episodes.level.fill_(len(env.task.levels))
+        env.reset()
+        drawn.append(env.task_arrays())
+    words = []
+    for key, (value, *_) in start.items():
+        name, _, index = key.removeprefix("start_").rpartition("_")
+        if name in drawn[0] and index.isdigit():
+            values, label = np.array([arrays[name][0, int(index)] for arrays in drawn]), f"{name}[{index}]"
+        else:
+            label = key.removeprefix("start_")
+            values = np.array([arrays[label][0] for arrays in drawn])
+        low, high = values.min(), values.max()
+        if max(low - value, value - high) > MARGIN * (high - low) > 0.0:
+            words.append(f"{label} {value:g} (resets sampled {low:.3g} to {high:.3g})")
+    if words:
+        print(f"jumper: beyond the training of {env.task.name}: {', '.join(words)}", file=sys.stderr)

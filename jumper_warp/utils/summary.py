@@ -20,6 +20,7 @@ from jumper_warp.utils.tables import WIDTH, print_table
 KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
 """Ends of the names of files by kind, in the order of the summary."""
 IN_RANGE = "in_range_"  # Prefix of metrics of the goals within a range
+NO_END, TIME_LIMIT = "no_end", "time limit"  # Outcome of a trial that had not ended: in metrics.json, as printed
 MOST_COLUMNS = 6  # Number of trials above which their values share one column
 MOST_PATHS = 3  # Number of files of a kind above which only their folder is printed
 
@@ -92,14 +93,19 @@ def _words(key: str, metric: MetricValue) -> str:
     """Return a metric's name in words, such as "apex error, mean size"; metrics of a range of goals name the range."""
     name = split_unit(key)[0].removeprefix(IN_RANGE).replace("_", " ")
     name = re.sub(r"( abs)? (mean|max|median)$", lambda found: f", {found[2]}" + " size" * bool(found[1]), name)
+    name = re.sub(r"^command (\d)$", r"command value \1, in the task's unit", name)
     goals = re.sub(r"^jumps (with goals of )?", "", metric.over or "")
-    return f"{name}, {goals}" if key.startswith(IN_RANGE) else name
+    name = re.sub(r"^ended by (.*) rate$", r"ended by \1", name).replace("by no end", f"by {TIME_LIMIT}")
+    name, training = re.subn(r"^(within|beyond) training ", "", name)
+    return f"{name}, {goals}" if training or key.startswith(IN_RANGE) else name
 
 
 def _text(key: str, value: Any, *, unit: bool = False) -> str:
     """Return a metric's value as text, a rate in percent; unit: append the unit of the metric's key."""
     if value is None:
         return "undefined"
+    if value == NO_END:
+        return TIME_LIMIT
     percent = key.endswith("_rate") and not key.endswith("yaw_rate") and isinstance(value, float | int)
     text, of = (format_value(100.0 * value), "%") if percent else (format_value(value), split_unit(key)[1])
     return f"{text} {of}" if unit and of else text

@@ -180,9 +180,8 @@ def _world_labels(recording: Recording, bases: np.ndarray, ranks: Sequence[int])
 
 
 def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
-    """Return the text at the top of a film: task, goal of a single world, and time."""
-    words = [str(recording.notes.get("task", "")), recording.label(ranks[0]) if len(ranks) == 1 else ""]
-    return "   ".join([*(word for word in words if word), f"{time:.2f} s"])
+    """Return the text at the top of a film: policy, task, goal of a single world, and time."""
+    return "   ".join(filter(None, [recording.heading(ranks), f"{time:.2f} s"]))
 
 
 def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:

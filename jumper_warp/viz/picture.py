@@ -30,6 +30,7 @@ GHOST = 0.4  # opacity of moments that would hide others
 SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
 STAYS = 0.6  # [m] horizontal distance up to which the moments are spread, since they would hide each other
 DRIFT = 0.15  # [m] horizontal distance up to which the picture shows the x axis; of each hop, up to which a robot stays
+TEXT = 0.14  # [m] height of a line of text above a robot
 IN_FRONT = 0.7  # [m] distance of the time axis of a robot that stays in place from the plane of the picture
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
@@ -93,17 +94,19 @@ class Composition:
     def point(self, along: float, height: float, in_front: float = 0.0) -> np.ndarray:
         """Return a point of the picture's vertical plane [m], (3,), world frame, from its two coordinates.
 
-        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it [m].
+        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it and
+        of all drawn robots [m], if not 0.
         """
-        depth = self.base[0] @ self.toward_eye + in_front
+        depths = (self.base[self.frames] if in_front else self.base[:1]) @ self.toward_eye
+        depth = depths.max() + in_front
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 
 
-def compose(recording: Recording, rank: int = 0) -> Composition:
+def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = None) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    The moments of a robot that moves by less than STAYS, or DRIFT a hop, are drawn spread to the right. Frames after
-    `valid_frames` are ignored. Raises InputError: no frame remains.
+    The moments of a robot that moves by less than STAYS, or DRIFT a hop, across the picture are drawn spread to the
+    right. eye: as in `write_picture`. Frames after `valid_frames` are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -114,8 +117,12 @@ def compose(recording: Recording, rank: int = 0) -> Composition:
     displacement = base[-1, :2] - base[0, :2]
     distance = float(np.linalg.norm(displacement))
     flights = _flights(recording, rank)
-    stays = distance < max(STAYS, DRIFT * len(flights))
+    across = None if eye is None else np.array([-eye[1], eye[0], 0.0]) / np.hypot(eye[0], eye[1])
+    width = distance if across is None else abs(float(displacement @ across[:2]))
+    stays = width < max(STAYS, DRIFT * len(flights))
     right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
+    if stays and across is not None:
+        right = across
     if not stays and flights:
         frames = _distinct(base @ np.stack([right, [0.0, 0.0, 1.0]], axis=1), flights)
     elif not stays:
@@ -141,15 +148,19 @@ def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
 def _events(height: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
     """Return the frames that show a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest.
 
-    Of several jumps: takeoff, apex and touchdown of the first two, and the squat between them.
+    Of several jumps: takeoff, apex and touchdown of the first, apexes spread over the others, and the end.
     """
     apexes = [first + int(np.argmax(height[first : last + 1])) for first, last in flights]
     (takeoff, touchdown), apex = flights[0], apexes[0]
     if len(flights) > 1:
-        squat = touchdown + int(np.argmin(height[touchdown : flights[1][0] + 1]))
-        return np.array([takeoff, apex, touchdown, squat, flights[1][0], apexes[1], flights[1][1]])
+        return np.array([takeoff, apex, touchdown, *_spread(apexes[1:], MOST - 4), len(height) - 1])
     squat = int(np.argmin(height[: takeoff + 1]))
     return np.array([squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1])
+
+
+def _spread(frames: list[int], count: int) -> list[int]:
+    """Return at most `count` of the frames, evenly spread over them."""
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
 
 
 def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
@@ -158,7 +169,13 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
     places: base positions in the picture [m], (num_frames, 2), to the right and up.
     """
     apexes = [first + int(np.argmax(places[first : last + 1, 1])) for first, last in flights]
-    wanted = [*apexes, len(places) - 1, 0, *(last for _, last in flights), *(first for first, _ in flights)]
+    wanted = [
+        *_spread(apexes, MOST - 2),
+        len(places) - 1,
+        0,
+        *(last for _, last in flights),
+        *(first for first, _ in flights),
+    ]
     chosen: list[int] = []
     while len(chosen) < MOST:
         distance = np.full(len(places), np.inf)
@@ -192,7 +209,7 @@ def write_picture(
     path = Path(path)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
         raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")
-    scene = compose(recording, rank)
+    scene = compose(recording, rank, eye)
     direction = scene.toward_eye + [0.0, 0.0, ELEVATION] if eye is None else np.array(eye, dtype=float)
     view, size = _framed(_extent(scene), direction, width)
     poses = recording.body_poses(rank)[scene.frames].astype(float)
@@ -202,7 +219,7 @@ def write_picture(
         phase(f"drawing {path.name} with {renderer.name}"),
     ):
         image = renderer.draw(poses, view, _lines(scene))
-    heading = "   ".join([str(recording.notes.get("task", "")), recording.label(rank)]) if title is None else title
+    heading = recording.heading([rank]) if title is None else title
     data = io.BytesIO()
     options = FORMATS[path.suffix]
     annotate(image, view, _labels(scene), heading, 0.0145 * width / size[1]).save(
@@ -309,7 +326,10 @@ def _labels(scene: Composition) -> list[Label]:
             continue
         time, height = f"{scene.recording.times[frame]:.2f} s", [f"{base[2]:.2f} m"] if jumps else []
         above = height if scene.stays else [time, *height]
-        labels.append(Label("\n".join(above), base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]))
+        place = base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]
+        if any(place[2] - 0.03 < bar < place[2] + TEXT * len(above) for bar in scene.heights):
+            place[2] = scene.heights.max() + 0.03
+        labels.append(Label("\n".join(above), place))
         if scene.stays:
             labels.append(Label(time, scene.point(base @ scene.right, scene.lowest - 0.03, IN_FRONT), "ma"))
     if scene.stays:

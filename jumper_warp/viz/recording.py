@@ -6,7 +6,7 @@ A recording is self-contained: it can be drawn without the Newton model.
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,16 @@ class Recording:
     def label(self, rank: int) -> str:
         """Return the name of the rank-th recorded world."""
         return self.labels[rank] if self.labels else f"world_{self.worlds[rank]}"
+
+    def heading(self, ranks: Sequence[int]) -> str:
+        """Return the title of a picture or film: policy and task of the notes, and the name of a single world."""
+        policy, task = (str(self.notes.get(key, "")) for key in ("policy", "task"))
+        same = not policy or policy.replace("_", "-") == task
+        words = [
+            policy or task if same else f"{policy} ({task})",
+            *(self.label(rank) for rank in ranks if len(ranks) == 1),
+        ]
+        return "   ".join(filter(None, words))
 
     def body_poses(self, rank: int) -> np.ndarray:
         """Return the poses of the rank-th recorded world's bodies, (num_frames, bodies, 7), the base first."""

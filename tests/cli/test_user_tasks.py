@@ -211,6 +211,15 @@ def test_play_does_not_need_training_functions(capsys, runs, tmp_path):
     assert (tmp_path / "jump.rrd").is_file() and "my_jumps" not in sys.modules
 
 
+@pytest.mark.parametrize("modules", [True, False])
+def test_paper_has_no_values_of_a_users_task(capsys, runs, path, tmp_path, modules):
+    given = ["--task-module", path] * modules
+    flags = ["--num-jumps", "2", "--device", "cpu", "--out", str(tmp_path)]
+    code, out, err = run(capsys, "evaluate", str(runs["tame-jump"]), *flags, *given)
+    assert code == 0, err
+    assert "no jump rate " in out and not any(line.endswith(" paper") for line in out.splitlines())
+
+
 def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, *play(runs["low-jump"]))
     assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': pass the file" in err[0]

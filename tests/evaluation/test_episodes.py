@@ -42,7 +42,7 @@ def episodes():
     """Four episodes: success after a step, a fall after two, one still running, one that diverges."""
     log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), StubEnv()
     log.begin(env)
-    assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
+    assert env.commands.tolist() == [[0.5, 0.1, 0.0]] * 4
     env.set(termination=[0, -1, -1, ENDS.index("diverged")])
     env.set(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
     assert not log.record_step(env)
@@ -72,11 +72,12 @@ def test_episode_metrics_match_hand_computed_values(episodes):
 
 def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     columns = episodes.columns()
-    assert columns["command_0"] == [0.5] * 4 and columns["command_3"] == [0.0] * 4
+    assert columns["command_0"] == [0.5] * 4 and columns["command_2"] == [0.0] * 4
     assert columns["length_s"] == [0.5, 1.0, 1.0, 0.5]
     assert columns["base_x_m"] == [1.5, 1.0, 1.0, None]
     assert columns["end"] == ["success", "low_base", "no_end", "diverged"]
-    series = {"height/base, episode 1 [m]": 0.0, "distance/from start, episode 1 [m]": pytest.approx(0.4)}
+    name = "episode 2, command 0.5 0.1 0"
+    series = {f"height/base, {name} [m]": 0.0, f"distance/from start, {name} [m]": pytest.approx(0.4)}
     assert episodes.series([1]) == series
 
 
@@ -151,12 +152,20 @@ def test_identical_episodes_are_one_trial(policy, tmp_path, capsys):
     metrics, goals = goals_of(policy, tmp_path / "a", "--command", "0.5")
     assert goals is None and metrics["length_mean_s"].trials == metrics["success_termination_rate"].trials == 1
     printed = capsys.readouterr()
-    assert "all 4 episodes are identical" in printed.err and "1 episode, " in " ".join(printed.out.split())
+    out = " ".join(printed.out.split())
+    assert "all 4 episodes are identical" in printed.err and "1 episode, " in out and "ended by time limit 100 %" in out
     assert goals_of(policy, tmp_path / "b", "--command", "0.5", "--randomize")[0]["length_mean_s"].trials == 4
     assert "identical" not in capsys.readouterr().err
 
 
-def test_policy_of_any_task_is_recorded(policy, tmp_path):
+def test_policy_of_any_task_is_recorded(policy, tmp_path, capsys):
     play.run([policy, *"--seconds 0.25 --device cpu --out".split(), str(tmp_path)], [])
     assert (tmp_path / "episode.rrd").stat().st_size > 1000
-    assert read_values(tmp_path)["end"] == ["no_end"]
+    values, printed = read_values(tmp_path), capsys.readouterr()
+    assert values["end"] == ["no_end"] and np.linalg.norm([values["start_goal_0"][0], values["start_goal_1"][0]]) > 0.1
+    assert "time limit" in printed.out and "start goal" in printed.out and "beyond" not in printed.err
+
+
+def test_command_beyond_those_of_resets_is_named_in_one_line(policy, tmp_path, capsys):
+    play.run([policy, *"--seconds 0.1 --device cpu --command 9 0.1 --out".split(), str(tmp_path)], [])
+    assert "jumper: beyond the training of any-task: goal[0] 9 (resets sampled -" in capsys.readouterr().err

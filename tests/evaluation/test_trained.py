@@ -7,7 +7,7 @@ from jumper_warp.evaluation.courses import CourseLog
 from jumper_warp.evaluation.heights import HeightPlayFlags
 from jumper_warp.evaluation.landings import LandingPlayFlags
 from jumper_warp.evaluation.scripts import parse_script
-from jumper_warp.evaluation.trained import warn_beyond_training
+from jumper_warp.evaluation.trained import trained_success, warn_beyond_training
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
 from jumper_warp.registry import make_task
 from jumper_warp.utils.metrics import format_value
@@ -46,6 +46,21 @@ def test_commands_of_a_script_are_compared_with_the_training_of_their_skill(caps
     CourseLog([script]).warn_beyond_training(tasks)
     up, ahead = capsys.readouterr().err.splitlines()
     assert "of vertical-jump: height 1.9 m" in up and "of horizontal-jump: distance ahead 5 m" in ahead
+
+
+def test_success_is_counted_within_and_beyond_the_training():
+    task = make_task("vertical-jump")  # trained 0.45 to 1.15 m
+    log = HeightPlayFlags((0.3, 0.45, 0.9, 1.1499, 1.3)).log(task)
+    log.end[:, 0] = log.terminations.index("success")
+    log.apex[:, 0], log.heading[:], log.rest_speed[:] = [0.3, 0.5, 0.9, 0.7, 0.7], 0.0, 0.0
+    metrics = trained_success(task, log)
+    counts = {key.split("_")[0]: (metric.value, metric.trials, metric.over) for key, metric in metrics.items()}
+    assert counts == {
+        "within": (pytest.approx(2 / 3), 3, "jumps with goals of trained 0.45 to 1.15 m"),
+        "beyond": (0.5, 2, "jumps beyond training"),
+    }
+    assert not trained_success(task, HeightPlayFlags((0.5, 0.9)).log(task))  # nothing to compare
+    assert not trained_success(make_task("attitude"), log)  # no range of goals
 
 
 def test_undefined_values_are_not_printed_as_none():

@@ -43,6 +43,26 @@ def test_summary_has_main_metrics_in_words_with_units_beside_the_papers_values(s
     assert lines[6] == ["steps", "12,346", "1/s"]
 
 
+def test_summary_names_ranges_and_ends_in_words(tmp_path, capsys):
+    keys = {
+        "within_training_success_rate": MetricValue(0.5, 2, None, "jumps with goals of trained 0.4 to 1.1 m"),
+        "beyond_training_success_rate": MetricValue(0.5, 2, None, "jumps beyond training"),
+        "ended_by_low_base_rate": MetricValue(0.1, 2, None, "episodes"),
+        "ended_by_no_end_rate": MetricValue(0.9, 2, None, "episodes"),
+        "end": "no_end",
+    }
+    write_metrics(tmp_path, keys)
+    print_summary(tmp_path, "2 jumps", keys, seconds=1.0)
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[2:7] == [
+        "success rate, trained 0.4 to 1.1 m 50 %",
+        "success rate, beyond training 50 %",
+        "ended by low base 10 %",
+        "ended by time limit 90 %",
+        "end time limit",
+    ]
+
+
 def test_summary_lists_picture_film_recording_and_metrics_but_no_other_files(summary):
     text, folder = summary()
     for kind, name in (

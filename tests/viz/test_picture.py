@@ -86,19 +86,44 @@ def test_each_of_two_jumps_in_a_row_has_its_apex():
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.1])  # [m] a hop
-def test_hops_in_place_show_the_first_two_over_time_without_their_path(drift):
+def test_hops_in_place_show_the_first_and_then_apexes_over_time_without_their_path(drift):
     positions, forces = jump(drift)
     hops = np.concatenate([positions + [drift * i, 0.0, 0.0] for i in range(8)])
     scene = compose(box_recording(hops, forces=np.tile(forces, 8)))
-    second = REST + 1  # first frame of the second hop
-    assert set(scene.frames) >= {TAKEOFF, APEX, TOUCHDOWN, *(second + TAKEOFF, second + APEX, second + TOUCHDOWN)}
-    assert len(scene.frames) == MOST and scene.frames[-1] == second + TOUCHDOWN
+    hop = REST + 1
+    assert list(scene.frames[:3]) == [TAKEOFF, APEX, TOUCHDOWN] and len(scene.frames) == MOST
+    assert [(frame - APEX) / hop for frame in scene.frames[3:-1]] == [1, 4, 7]
+    assert scene.frames[-1] == 8 * hop - 1
     assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
     axis, *_ = (line.points for line in picture._lines(scene))
     assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, Z] == pytest.approx(scene.lowest)
     times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
     assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
     assert all(label.point[Z] < scene.lowest for label in times)
+
+
+def test_jumps_ahead_are_shown_to_the_end():
+    positions, forces = jump(0.4)
+    hops = np.concatenate([positions + [0.4 * i, 0.0, 0.0] for i in range(12)])
+    scene = compose(box_recording(hops, forces=np.tile(forces, 12)))
+    assert {0, len(hops) - 1} <= set(scene.frames) and len(scene.frames) == MOST
+
+
+@pytest.mark.parametrize("distance", [0.0, 1.5])
+def test_front_view_shows_the_robots_side_by_side(distance):
+    scene = compose(jump_recording(distance), eye=(3.0, 0.0, 0.5))
+    assert scene.right == pytest.approx([0.0, 1.0, 0.0]) and scene.toward_eye == pytest.approx([1.0, 0.0, 0.0])
+    assert np.diff(scene.bases[:, Y]) == pytest.approx(SPREAD) and len(scene.frames) == 7
+    axis, *_ = (line.points for line in picture._lines(scene))
+    assert axis[:, X].min() > scene.bases[:, X].max()  # in front of all robots
+
+
+@pytest.mark.parametrize("height", np.arange(0.35, 1.0, 0.05))
+def test_labels_of_robots_are_not_on_the_bar_of_the_commanded_height(height):
+    scene = compose(jump_recording(heights=np.array([height], np.float32)))
+    for label in picture._labels(scene):
+        if label.anchor == "md":
+            assert not label.point[Z] - 0.02 < height < label.point[Z] + 0.12
 
 
 def test_lifted_paws_without_rise_are_no_jump():

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from rerun.chunk import RrdReader
 
+from box_robot import box_recording, walk
 from columns import X, Z
 from jumper_warp.robot.model import build_model
 from jumper_warp.viz.recorder import Recorder
@@ -323,3 +324,13 @@ def test_recorder_refuses_a_missing_world_and_an_empty_recording(model):
         Recorder(model, (0, 2))
     with pytest.raises(ValueError, match="the recording has no frames"):
         Recorder(model).recording()
+
+
+@pytest.mark.parametrize(
+    ("policy", "task", "words"),
+    [("", "pronk", "pronk"), ("vertical_jump", "vertical-jump", "vertical_jump"), ("mine", "pronk", "mine (pronk)")],
+)
+def test_heading_names_policy_task_and_a_single_world(policy, task, words):
+    notes = {"policy": policy, "task": task} if policy else {"task": task}
+    recording = box_recording(walk(1.0), notes=notes, labels=("0.90 m",))
+    assert recording.heading([0]) == f"{words}   0.90 m" and recording.heading([0, 1]) == words
