@@ -8,7 +8,7 @@ from PIL import Image
 from scipy import ndimage
 
 from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
-from columns import XY, X, Z
+from columns import XY, X, Y, Z
 from jumper_warp.evaluation.recorder import save_recording
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import picture
