@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.landings import random_headings
+from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import PAPER

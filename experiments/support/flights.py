@@ -17,7 +17,7 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed, outcome_names
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_config
 from jumper_warp.policies.policy import Policy
@@ -185,15 +185,11 @@ class FlightLog(EvaluationLog):
             "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
             "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
         }  # fmt: skip
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last tilt [deg] and base height [m] of some worlds."""
-        series = {}
-        for world in worlds:
-            series[f"tilt/of {world} [deg]"] = float(np.degrees(self.tilts[-1][world]))
-            series[f"height/base of {world} [m]"] = float(self.heights[-1][world])
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the last tilt [deg] and base height [m] of all worlds."""
+        return {"tilt/of {} [deg]": np.degrees(self.tilts[-1]), "height/base of {} [m]": self.heights[-1]}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return commanded heights `asked_m` and delays of the extension `late_ms` (front, left) of some worlds."""

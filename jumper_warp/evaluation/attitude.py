@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, finite
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
@@ -125,15 +125,12 @@ class AttitudeLog(EvaluationLog):
         """Return lists with one value per turn: turn_x to turn_w, error_deg, first_s, settling_s, end (outcome)."""
         columns = {f"turn_{axis}": self.turns[:, i] for i, axis in enumerate("xyzw")}
         columns |= {"error_deg": np.degrees(self.error), "first_s": self.first_time, "settling_s": self.settling_time}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current angle to the goal [deg] and angular speed [rad/s] of some worlds; NaN is replaced by 0."""
-        series = {}
-        for name, world in zip(self.names(worlds), worlds, strict=True):
-            series[f"error/angle to goal, {name} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
-            series[f"spin/angular speed, {name} [rad/s]"] = float(np.nan_to_num(self.angular_speeds[-1][world]))
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current angle to the goal [deg] and angular speed [rad/s] of all worlds; NaN is replaced by 0."""
+        error, speed = np.nan_to_num(self.errors[-1]), np.nan_to_num(self.angular_speeds[-1])
+        return {"error/angle to goal, {} [deg]": np.degrees(error), "spin/angular speed, {} [rad/s]": speed}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commanded turns of some worlds: key `turns_xyzw`, a list of quaternions."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.jumps import updated_apex
-from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed, outcome_names
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
@@ -55,7 +55,7 @@ OUTCOMES = tuple(outcome_names([term.name for term in FALLS], "stuck", "done").t
 GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {JUMP_UP: "C4", JUMP_TO: "C3"}  # Shades of plots, by skill
-NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
+NAMES = ("walk", "jump up", "jump to")  # By skill
 
 
 @dataclass
@@ -283,29 +283,21 @@ class CourseLog(EvaluationLog):
         Keys: end, commands_done, apex_error_m, landing_error_m.
         """
         worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
-        done = {"end": self.outcomes.tolist(), "commands_done": (self.finish_step >= 0).sum(axis=1).tolist()}
-        return done | {name: finite(values) for name, values in worst.items()}
+        return listed({"end": self.outcomes, "commands_done": (self.finish_step >= 0).sum(axis=1)} | worst)
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current velocity, command and base height [m] of some robots."""
-        rows, names = list(worlds), self.names(worlds)
-        series = velocity_series(self.velocity[-1][rows], self.velocity_commands(worlds), names)
-        return series | {
-            f"height/base, {name} [m]": self.height[-1][row] for name, row in zip(names, rows, strict=True)
-        }
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current velocity, command and base height [m] of all robots."""
+        series = velocity_series(self.velocity[-1], self.marks()["commands"])
+        return series | {"height/base, {} [m]": self.height[-1]}
 
-    def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the skill that was active in some robots' last policy step."""
-        skills = self.skills[-1][list(worlds)]
-        return {f"skill/{name}": NAMES[skill] for name, skill in zip(self.names(worlds), skills, strict=True)}
+    def states(self) -> dict[str, np.ndarray]:
+        """Return the skill that was active in all robots' last policy step."""
+        return {"skill/{}": np.array(NAMES)[self.skills[-1]]}
 
-    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the current commands of some robots, (worlds, 3), 0 while a robot does not walk."""
-        return np.nan_to_num(self.commands[-1][list(worlds)])
-
-    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the goals [m] of some robots' jumps, world frame, (worlds, commands, 3), z = 0; NaN for others."""
-        return np.pad(self.goal_world[list(worlds)], ((0, 0), (0, 0), (0, 1)))
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the goals of all robots' jumps, z = 0, NaN for others, and the commands, 0 while it does not walk."""
+        goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
+        return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the scripts of some robots: key `scripts`, lists of [kind, *values]."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import FLOAT32_MAX
@@ -103,15 +103,13 @@ class EpisodeLog(EvaluationLog):
         columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
         columns |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current base height and horizontal distance from the start [m] of some worlds."""
-        series, pos = {}, self.arrays["base_pos"]
-        for name, world in zip(self.names(worlds), worlds, strict=True):
-            series[f"height/base, {name} [m]"] = pos[world, 2]
-            series[f"distance/from start, {name} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current base height and horizontal distance from the start [m] of all worlds."""
+        pos = self.arrays["base_pos"]
+        distance = np.linalg.norm((pos - self.start_position)[:, :2], axis=1)
+        return {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some worlds: key `commands`, a list of rows."""

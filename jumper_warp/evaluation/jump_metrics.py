@@ -1,14 +1,10 @@
-"""Metrics of jumps to heights and to landing positions, and the common flags of their evaluations."""
+"""Metrics of jumps to heights and to landing positions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
-from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome
-from jumper_warp.evaluation.log import within
-from jumper_warp.utils.errors import InputError
+from jumper_warp.evaluation.jumps import JumpOutcome
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
@@ -85,25 +81,3 @@ def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metric
     """
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
-
-
-@dataclass(frozen=True)
-class JumpFlags:
-    """Flags of jumps from rest in the default pose."""
-
-    num_jumps: int = 200  # Number of jumps
-    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
-    """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
-
-    def __post_init__(self) -> None:
-        if self.num_jumps < 1:
-            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
-        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
-            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
-
-    def metrics(self, log: JumpLog) -> Metrics:
-        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
-        (low, high), outcome = self.success_range, log.outcome
-        size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance; the other is 0
-        inside = within(size, self.success_range)
-        return jump_metrics(outcome) | range_metrics(outcome, inside, f"with goals of {low:g} to {high:g} m")

@@ -15,8 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
-from jumper_warp.evaluation.landings import LandingLog
+from jumper_warp.evaluation.jumps import TOLERANCE, JumpLog, JumpOutcome
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
@@ -63,7 +62,7 @@ class BasePaths:
     def __init__(self) -> None:
         self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
 
-    def __call__(self, landings: LandingLog) -> None:
+    def __call__(self, landings: JumpLog) -> None:
         """Append the current base positions; NaN for worlds whose last jump has ended."""
         running = landings.current < landings.goals.shape[1]
         self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
@@ -111,7 +110,7 @@ class Grid(Suite):
             run.folder / "grid.png", {"": landed_at(landings)}, tolerance=TOLERANCE,
             title="Jumps to a grid of goals", conditions=f"{run.title}, {len(landings.end)} jumps",
         )  # fmt: skip
-        inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
+        inside = landings.goals[..., 0] < AHEAD[1] - 1.0e-6
         outcome = landings.outcome
         return jump_metrics(outcome) | range_metrics(outcome, inside, "less than 1.4 m ahead")
 
@@ -187,7 +186,7 @@ class Consecutive(Suite):
         return consecutive_metrics(*logs)
 
 
-def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
+def consecutive_metrics(pairs: JumpLog, row: JumpLog) -> Metrics:
     """Return the metrics of pairs of jumps, and of long sequences of jumps as `row_<key>`.
 
     pairs: the first half diagonal, the second half straight.
@@ -260,7 +259,7 @@ class Platform(Suite):
         rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
         run.settings["edge_m"], values = self.edge, {}
-        done: dict[str, LandingLog] = {}
+        done: dict[str, JumpLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
             env = run.env(self.num_jumps, **scene)
             done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=scene)
@@ -333,9 +332,9 @@ class Farthest(Suite):
         return distance_metrics(bins)
 
 
-def landed_at(landings: LandingLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def landed_at(landings: JumpLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return goals [m], landing positions [m], (worlds, 2) each, and success (worlds,) of first jumps, for plots."""
-    return landings.goal_positions[:, 0], landings.landing[:, 0], landings.success[:, 0]
+    return landings.goals[:, 0, :2], landings.landing[:, 0], landings.success[:, 0]
 
 
 def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
@@ -343,7 +342,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
     return np.array([[(x0, y0), (x1, y0), (x1, y1), (x0, y1)]])
 
 
-def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
+def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     """Return reliable jump distances, the metrics of all jumps, and those of each bin as lists `bin_<key>`.
 
     bins: logs by distance at the bin's middle [m], ascending.
@@ -351,7 +350,7 @@ def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
     outcomes = [landings.outcome for landings in bins.values()]
     together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
                               for name in (field.name for field in fields(JumpOutcome))})  # fmt: skip
-    goals = np.concatenate([landings.goal_positions for landings in bins.values()])
+    goals = np.concatenate([landings.goals for landings in bins.values()])
     inside = within(goals[..., 0], IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]
     lists: dict[str, list[Any]] = {key: [metrics[key].value for metrics in by_bin] for key in MEANS}

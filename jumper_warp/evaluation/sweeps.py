@@ -10,11 +10,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation import heights, landings
-from jumper_warp.evaluation.heights import HeightFlags
+from jumper_warp.evaluation.jump_flags import HEIGHT_PAPER, PLACE_PAPER, HeightFlags, LandingFlags
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
-from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_terminations
-from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
+from jumper_warp.evaluation.jumps import (
+    DELAY,
+    REST_TIME,
+    TOLERANCE,
+    JumpLog,
+    random_headings,
+    with_jump_terminations,
+    with_second_takeoff,
+)
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
 from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
@@ -84,15 +90,15 @@ class Suite(EvaluationArgs, ABC):
     def run_landings(
         self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
         delay: np.ndarray | float = DELAY, **options: Any,
-    ) -> LandingLog:  # fmt: skip
+    ) -> JumpLog:  # fmt: skip
         """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
-        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `LandingLog`; options:
+        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `JumpLog`; options:
         keywords of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(goals)) if env is None else env
         headings = random_headings(len(goals), self.stream_seed) if headings is None else headings
-        log = LandingLog(goals, termination_names(env.task), headings, delay, self.rest_time)
+        log = JumpLog(goals, termination_names(env.task), headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, metrics: Callable[[Conditions], Metrics], *names: str) -> Metrics:
@@ -125,7 +131,7 @@ class HeightSweep(Suite):
 
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
-    paper: ClassVar = heights.PAPER
+    paper: ClassVar = HEIGHT_PAPER
     summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
                          "open_loop_apex_mean_m")  # fmt: skip
     least: ClassVar = (3, 0.1)
@@ -147,7 +153,7 @@ class HeightSweep(Suite):
         jumps = self.run_flags(run, flags, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         plot_sweep(
-            run.folder / "sweep.png", jumps.commanded[:, 0], jumps.apex[:, 0], jumps.reached[:, 0], limit=limit,
+            run.folder / "sweep.png", jumps.goals[:, 0, 2], jumps.apex[:, 0], jumps.outcome.reached[:, 0], limit=limit,
             tolerance=TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
             labels=("commanded base height [m]", "highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
@@ -156,8 +162,8 @@ class HeightSweep(Suite):
         def pushed(conditions: Conditions) -> Metrics:
             return flags.metrics(self.run_flags(run, flags, run.env(self.num_jumps, None, conditions)))
 
-        inside = within(jumps.commanded, flags.success_range)
-        values = flags.metrics(jumps) | limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside)
+        inside = within(jumps.goals[..., 2], flags.success_range)
+        values = flags.metrics(jumps) | limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
         names = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
                  "miss_rate", "apex_error_abs_mean_m")  # fmt: skip
         return values | self.pushed_in_flight(run, pushed, *names)
@@ -181,7 +187,7 @@ class DistanceSweep(Suite):
     num_recorded: int = 5
 
     name: ClassVar = "sweep"
-    paper: ClassVar = landings.PAPER
+    paper: ClassVar = PLACE_PAPER
     summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
     least: ClassVar = (3, 0.1)
 
@@ -197,14 +203,14 @@ class DistanceSweep(Suite):
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
-    def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
+    def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> JumpLog:
         """Run one jump per distance in given conditions, return the log; film: name of the recording, or empty."""
         change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
         return self.run_flags(run, self.flags, run.env(self.num_jumps, change, conditions), film)
 
-    def metrics(self, log: LandingLog) -> Metrics:
+    def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of `jumper evaluate`, and the success rate over the paper's range of training."""
-        inside, note = within(log.goal_positions[..., 0], PAPER_TRAINED), "over 0.4 to 1 m"
+        inside, note = within(log.goals[..., 0], PAPER_TRAINED), "over 0.4 to 1 m"
         success = chosen(PLACE_METRICS, "success_rate")
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 
@@ -213,7 +219,7 @@ class DistanceSweep(Suite):
         run.settings["end_at_second_takeoff"] = self.end_at_second_takeoff
         landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)["trained_range_m"]
         plot_sweep(
-            run.folder / "sweep.png", landings.goal_positions[:, 0, 0], landings.landing[:, 0, 0],
+            run.folder / "sweep.png", landings.goals[:, 0, 0], landings.landing[:, 0, 0],
             landings.success[:, 0], tolerance=TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
             trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
             labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",

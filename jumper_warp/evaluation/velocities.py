@@ -11,7 +11,7 @@ import tyro
 from numpy.typing import ArrayLike
 
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.log import EvaluationLog, finite, outcome_names
+from jumper_warp.evaluation.log import EvaluationLog, listed, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
@@ -150,7 +150,7 @@ class VelocityLog(EvaluationLog):
         error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
@@ -181,10 +181,9 @@ class VelocityLog(EvaluationLog):
             error[(since > 0) & (since <= round(SETTLING_TIME / self.step_dt))] = np.nan
         return error
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current velocities and commands of some robots."""
-        rows = list(worlds)
-        return velocity_series(self.velocity[-1][rows], self.command_history()[-1][rows], self.names(worlds))
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current velocities and commands of all robots."""
+        return velocity_series(self.velocity[-1], self.command_history()[-1])
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
@@ -194,9 +193,9 @@ class VelocityLog(EvaluationLog):
         """Return all commanded velocities, (robots, commands, 3)."""
         return self.commands
 
-    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the current commands of some robots, (worlds, 3)."""
-        return self.command_history()[-1][list(worlds)]
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the current commands of all robots."""
+        return {"commands": self.command_history()[-1]}
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -210,13 +209,11 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
-def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[str]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of named robots in the form of `EvaluationLog.series`."""
+def velocity_series(velocity: np.ndarray, command: np.ndarray) -> dict[str, np.ndarray]:
+    """Return velocities and commands of all robots, (robots, 3) each, in the form of `EvaluationLog.series`."""
     series = {}
-    for robot, name in enumerate(names):
-        for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
-            series[f"{axis}/actual, {name} [{unit}]"] = float(velocity[robot, i])
-            series[f"{axis}/command, {name} [{unit}]"] = float(command[robot, i])
+    for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
+        series |= {f"{axis}/actual, {{}} [{unit}]": velocity[:, i], f"{axis}/command, {{}} [{unit}]": command[:, i]}
     return series
 
 

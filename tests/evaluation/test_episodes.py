@@ -77,7 +77,7 @@ def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     assert columns["base_x_m"] == [1.5, 1.0, 1.0, None]
     assert columns["end"] == ["success", "low_base", "no_end", "diverged"]
     series = {"height/base, episode 1 [m]": 0.0, "distance/from start, episode 1 [m]": pytest.approx(0.4)}
-    assert episodes.series([1]) == series
+    assert episodes.named(episodes.series(), [1]) == series
 
 
 def test_update_returns_true_when_all_episodes_ended():  # 3: index of any termination

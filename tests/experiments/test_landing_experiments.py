@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from experiments import paper_tests
-from jumper_warp.evaluation.jumps import TERMINATIONS
-from jumper_warp.evaluation.landings import LandingLog
+from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
@@ -50,7 +49,7 @@ def landing_log(goals, landing, end, **changes):
 
     goals, landing [m]: (worlds, jumps, 2), world; end: indices of terminations; changes: other arrays of the log.
     """
-    landings = LandingLog(np.array(goals, dtype=float), TERMINATIONS)
+    landings = JumpLog(np.array(goals, dtype=float), TERMINATIONS)
     landings.end[:] = end
     landings.goal_world[:], landings.end_position[:], landings.touchdown[:] = goals, landing, landing
     landings.takeoff[:], landings.rest_position[:], landings.rest_speed[:] = 0.0, landing, 0.0
@@ -127,7 +126,7 @@ def test_row_without_fall_may_miss_goals():
 
 def test_base_paths_are_in_start_frame():
     base_paths = BasePaths()
-    landings = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS)
+    landings = JumpLog(np.zeros((2, 1, 2)), TERMINATIONS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
         landings.arrays = {"base_pos": np.array([place, place])}
         base_paths(landings)
@@ -237,7 +236,7 @@ def hops():
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = LandingLog(
+    landings = JumpLog(
         goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
     script = HopPolicy()
