@@ -17,7 +17,7 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed, outcome_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_config
 from jumper_warp.policies.policy import Policy
@@ -38,7 +38,7 @@ HIGH = 0.7  # [m] Base height above which no paw can touch level ground
 UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
 CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
 AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
-OUTCOMES = tuple(outcome_names([term.name for term in FALLS_FROM_FLIGHT], "landed", "tilted", "no_takeoff").tolist())
+OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
 """Outcomes by index `FlightLog.end`."""
 LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 """Sides of the legs FL, FR, BL, BR: 1 front or left, -1 back or right; columns: front, left."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, listed
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
@@ -185,8 +185,7 @@ class AttitudeFlags:
             raise InputError(f"num_turns must be at least {len(DIRECTIONS)}, got {self.num_turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
             raise InputError(f"angle and tolerance must be in (0, 180] degrees, got {self.angle}, {self.tolerance}")
-        if not 0.1 <= self.seconds <= 60.0:
-            raise InputError(f"seconds must be in [0.1, 60], got {self.seconds}")
+        check(0.1 <= self.seconds <= 60.0, f"seconds must be in [0.1, 60], got {self.seconds}")
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the log of the turns, one per world; task and seed have no effect."""
@@ -206,8 +205,7 @@ class AttitudePlayFlags:
     length = 4.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.angle <= 180.0:
-            raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
+        check(0.0 < self.angle <= 180.0, f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:
         """Return the log of six turns, one per robot, in the order of DIRECTIONS; task has no effect."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.jumps import updated_apex
-from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed, outcome_names
+from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
@@ -51,7 +51,7 @@ NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period and duration of the steps of 
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
-OUTCOMES = tuple(outcome_names([term.name for term in FALLS], "stuck", "done").tolist())
+OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
 GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {JUMP_UP: "C4", JUMP_TO: "C3"}  # Shades of plots, by skill

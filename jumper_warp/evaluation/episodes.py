@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed, outcome_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed, termination_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import FLOAT32_MAX
@@ -89,7 +89,7 @@ class EpisodeLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Name of the termination of each episode, (num_envs,); NO_END if it has not ended."""
-        return outcome_names([term.name for term in self.task.terminations], NO_END)[self.end]
+        return np.array([*termination_names(self.task), NO_END])[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
         """Return whether each episode ended by a termination with an option, `success` or `time_out`, (num_envs,)."""
@@ -170,8 +170,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
         raise InputError(f"num_episodes must be at least 1, got {count}")
     if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
-    if not 0.0 < seconds <= MAX_SECONDS:
-        raise InputError(f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
+    check(0.0 < seconds <= MAX_SECONDS, f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:

@@ -11,7 +11,7 @@ import tyro
 
 from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
 from jumper_warp.evaluation.jumps import JumpLog, random_headings
-from jumper_warp.evaluation.log import termination_names, within
+from jumper_warp.evaluation.log import check, termination_names, within
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
@@ -98,8 +98,7 @@ class LandingFlags(JumpFlags):
         super().__post_init__()
         for name in ("goal_x", "goal_y"):
             low, high = getattr(self, name)
-            if not -10.0 < low <= high < 10.0:
-                raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
+            check(-10.0 < low <= high < 10.0, f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
         if self.heading != "any":
             check_finite("heading", self.heading)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, listed, outcome_names
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, listed
 from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
@@ -332,7 +332,7 @@ class JumpLog(EvaluationLog):
     @property
     def ends(self) -> np.ndarray:
         """End of each jump, (num_envs, jumps in a row): SUCCESS, another outcome, NO_END or NOT_BEGUN."""
-        return np.where(np.isnan(self.heading), NOT_BEGUN, outcome_names(self.terminations, NO_END)[self.end])
+        return np.where(np.isnan(self.heading), NOT_BEGUN, np.array([*self.terminations, NO_END])[self.end])
 
     @property
     def outcome(self) -> JumpOutcome:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
 from jumper_warp.utils.progress import phase
 
@@ -126,6 +127,12 @@ def run_evaluation(
             advance()
 
 
+def check(condition: bool, message: str) -> None:
+    """Raise InputError with the message unless the condition holds."""
+    if not condition:
+        raise InputError(message)
+
+
 def termination_names(task: TaskCfg) -> tuple[str, ...]:
     """Return the names of a task's terminations, in the order in which they are checked."""
     return tuple(term.name for term in task.terminations)
@@ -134,11 +141,6 @@ def termination_names(task: TaskCfg) -> tuple[str, ...]:
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """Return whether each value [m] is between two limits, bool of the same shape, with tolerance for rounding."""
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
-
-
-def outcome_names(terminations: Sequence[str], *more: str) -> np.ndarray:
-    """Return the names of outcomes by index of the termination that ended an episode; more: names to append."""
-    return np.array([*terminations, *more])
 
 
 def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:

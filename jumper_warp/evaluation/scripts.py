@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jumper_warp.evaluation.log import check
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_json
 
@@ -62,8 +63,7 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
         raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
     steps = tuple(_step(i, item) for i, item in enumerate(content))
     total = sum(step.seconds for step in steps)
-    if not total <= MAX_SECONDS:
-        raise InputError(f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
+    check(total <= MAX_SECONDS, f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
     return steps
 
 
@@ -94,8 +94,7 @@ def _seconds(where: str, value: Any) -> float:
     where: prefix of messages.
     """
     (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
-    if not seconds > 0.0:
-        raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
+    check(seconds > 0.0, f"{where}: seconds must be positive, got {seconds:g}")
     return seconds
 
 
@@ -107,6 +106,5 @@ def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tupl
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )
-    if not good:
-        raise InputError(f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
+    check(good, f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
     return tuple(float(v) for v in values)

@@ -11,7 +11,7 @@ import tyro
 from numpy.typing import ArrayLike
 
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.log import EvaluationLog, listed, outcome_names
+from jumper_warp.evaluation.log import EvaluationLog, check, listed, termination_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
@@ -126,7 +126,7 @@ class VelocityLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Outcome of each robot, (robots,): name of the termination by which it fell, `walked` if it did not fall."""
-        return outcome_names([term.name for term in self.task.terminations], "walked")[self.end]
+        return np.array([*termination_names(self.task), "walked"])[self.end]
 
     def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3); NaN after a fall."""
@@ -324,9 +324,6 @@ class VelocityPlayFlags:
 
 def check_velocity_settings(robots: int, seconds: float, *commands: float) -> None:
     """Raise InputError unless number of robots, time [s] and commanded velocities are within their limits."""
-    if not 1 <= robots <= MAX_ROBOTS:
-        raise InputError(f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
-    if not 0.0 < seconds <= 600.0:
-        raise InputError(f"seconds must be in (0, 600], got {seconds}")
-    if not all(abs(value) <= 10.0 for value in commands):
-        raise InputError(f"commands must be within 10 m/s or rad/s, got {commands}")
+    check(1 <= robots <= MAX_ROBOTS, f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
+    check(0.0 < seconds <= 600.0, f"seconds must be in (0, 600], got {seconds}")
+    check(all(abs(value) <= 10.0 for value in commands), f"commands must be within 10 m/s or rad/s, got {commands}")
