@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import open_loop_jump
-from jumper_warp.evaluation.jump_flags import LandingPlayFlags
+from jumper_warp.evaluation.jump_metrics import LandingPlayFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording

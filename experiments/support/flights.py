@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
+from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_config
@@ -27,6 +27,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
+from jumper_warp.utils.rotations import yaw_of
 from jumper_warp.viz.plots import figure
 from support.momentum import momentum
 

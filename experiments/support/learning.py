@@ -17,7 +17,7 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.ppo import Ppo
@@ -53,7 +53,7 @@ def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> JumpLog:
     """Run one jump per world to commanded heights [m], (num_envs,), return the log; act: see `run_evaluation`."""
-    jumps = JumpLog(heights, termination_names(env.task))
+    jumps = JumpLog(heights, env.task.termination_names)
     run_evaluation(act, env, jumps)
     return jumps
 

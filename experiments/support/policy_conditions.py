@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.evaluation.attitude import AttitudeFlags
-from jumper_warp.evaluation.jump_flags import JumpFlags
+from jumper_warp.evaluation.jump_metrics import JumpFlags
 from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.cfg import TaskCfg

@@ -151,14 +151,6 @@ TURN_METRICS = (
 """Table of the metrics of turns; a turn has settled if its error stays within the tolerance until the end."""
 
 
-def turn_metrics(turns: AttitudeLog, prefix: str = "", note: str = "") -> Metrics:
-    """Return success rate, settling times, errors and failures of a log of turns, the metrics TURN_METRICS.
-
-    prefix, note: see `measure`.
-    """
-    return measure(TURN_METRICS, turns, None, prefix, note)
-
-
 def axis_metrics(turns: AttitudeLog) -> Metrics:
     """Return success rate, settling time and final error of turns about each body axis and direction.
 
@@ -193,7 +185,7 @@ class AttitudeFlags:
 
     def metrics(self, log: AttitudeLog) -> Metrics:
         """Return the metrics of a finished log of turns, together and for each axis and direction."""
-        return turn_metrics(log) | axis_metrics(log)
+        return measure(TURN_METRICS, log) | axis_metrics(log)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed, termination_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import FLOAT32_MAX
@@ -56,17 +56,13 @@ class EpisodeLog(EvaluationLog):
             env.reset()
         arrays = env.task_arrays()
         self.start_position = arrays["base_pos"].copy()
-        self._compare(arrays)
+        self.identical &= rows_are_equal(arrays)
         if not self.commands.shape[1]:
             self._start = sampled_numbers(arrays)
 
-    def _compare(self, arrays: dict[str, np.ndarray]) -> None:
-        """Update `identical` from the arrays of `read_env`."""
-        self.identical = self.identical and all(map(rows_are_equal, arrays.values()))
-
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
-        self._compare(arrays)
+        self.identical = self.identical and rows_are_equal(arrays)
         running = self.end < 0
         self.end_position[running] = arrays["base_pos"][running]
         self._height_sum[running] += arrays["base_pos"][running, 2]
@@ -89,7 +85,7 @@ class EpisodeLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Name of the termination of each episode, (num_envs,); NO_END if it has not ended."""
-        return np.array([*termination_names(self.task), NO_END])[self.end]
+        return np.array([*self.task.termination_names, NO_END])[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
         """Return whether each episode ended by a termination with an option, `success` or `time_out`, (num_envs,)."""
@@ -115,18 +111,11 @@ class EpisodeLog(EvaluationLog):
         """Return the commands of some worlds: key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
-    def first(self) -> EpisodeLog:
-        """Return a log of the first episode alone."""
-        log = EpisodeLog(self.commands[:1], self.task, self.seconds)
-        for name in ("end", "length", "start_position", "end_position", "_height_sum", "_steps"):
-            setattr(log, name, getattr(self, name)[:1])
-        return log
 
-
-def rows_are_equal(values: np.ndarray) -> bool:
-    """Return whether all rows of an array are equal within rounding, NaN included."""
-    numbers = np.asarray(values, dtype=float)
-    return np.allclose(numbers, numbers[:1], rtol=1e-6, atol=1e-6, equal_nan=True)
+def rows_are_equal(arrays: dict[str, np.ndarray]) -> bool:
+    """Return whether all rows of each array are equal within rounding, NaN included."""
+    numbers = [np.asarray(values, dtype=float) for values in arrays.values()]
+    return all(np.allclose(each, each[:1], rtol=1e-6, atol=1e-6, equal_nan=True) for each in numbers)
 
 
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -136,29 +125,28 @@ def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
     columns = {}
     for name, values in arrays.items():
-        if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or rows_are_equal(values):
+        if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or rows_are_equal({name: values}):
             continue
         parts = {f"_{i}": values[:, i] for i in range(values.shape[1])} if values.ndim == 2 else {"": values}
         columns |= {f"start_{name}{end}": part.copy() for end, part in parts.items()}
     return columns
 
 
-def episode_metrics(episodes: EpisodeLog) -> Metrics:
+def episode_metrics(episodes: EpisodeLog, count: int | None = None) -> Metrics:
     """Return rates of outcomes, and mean length, base height and displacement, of a log of episodes.
 
-    `ended_by_<outcome>_rate` is the rate of a termination.
+    `ended_by_<outcome>_rate` is the rate of a termination. count: number of episodes to measure (default: all).
     """
-    running, over = episodes.end < 0, "episodes"
-    success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
-    displacement, distance = episodes.displacement, np.linalg.norm(episodes.displacement, axis=1)
+    running, over, displacement = episodes.end[:count] < 0, "episodes", episodes.displacement[:count]
+    success, timed_out = (episodes.ended_with(option)[:count] for option in ("success", "time_out"))
     return {
         "success_termination_rate": rate(success, over),
         "failure_termination_rate": rate(~running & ~success & ~timed_out, over),
-        **ended_by(episodes.outcomes, over),
-        "length_mean_s": mean(episodes.length, over),
-        "base_height_mean_m": mean(episodes.mean_height, over),
-        "base_height_at_end_mean_m": mean(episodes.end_position[:, 2], over),
-        "distance_from_start_mean_m": mean(distance, over),
+        **ended_by(episodes.outcomes[:count], over),
+        "length_mean_s": mean(episodes.length[:count], over),
+        "base_height_mean_m": mean(episodes.mean_height[:count], over),
+        "base_height_at_end_mean_m": mean(episodes.end_position[:count, 2], over),
+        "distance_from_start_mean_m": mean(np.linalg.norm(displacement, axis=1), over),
         "moved_x_signed_mean_m": mean(displacement[:, 0], over),
         "moved_y_signed_mean_m": mean(displacement[:, 1], over),
     }
@@ -212,7 +200,7 @@ class EpisodeFlags:
             return episode_metrics(log)
         reason = "nothing was sampled; they count as one trial. --randomize samples robots"
         print(f"jumper: all {log.count} episodes are identical: {reason}", file=sys.stderr)
-        return episode_metrics(log.first())
+        return episode_metrics(log, 1)
 
 
 @dataclass(frozen=True)

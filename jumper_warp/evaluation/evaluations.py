@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
-from jumper_warp.evaluation.jump_flags import (
+from jumper_warp.evaluation.jump_metrics import (
     HEIGHT_PAPER,
     PLACE_PAPER,
     HeightFlags,

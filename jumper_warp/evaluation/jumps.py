@@ -13,6 +13,7 @@ from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -50,12 +51,6 @@ def with_second_takeoff(task: TaskCfg) -> TaskCfg:
 def random_headings(count: int, seed: int) -> np.ndarray:
     """Return uniformly random headings [rad] in -pi..pi, (count,)."""
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, count)
-
-
-def from_world(vector: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """Return the components ahead and to the left of headings [rad], (...), of vectors x, y in world axes, (..., 2)."""
-    (x, y), cos, sin = np.moveaxis(vector, -1, 0), np.cos(heading), np.sin(heading)
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
@@ -154,7 +149,7 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         """Return the distances of positions (..., 2) from the goals, NaN where the simulation diverged."""
         return known(np.linalg.norm(position - jumps.goal_world, axis=-1))
 
-    ahead, left = np.moveaxis(from_world(jumps.rest_position - jumps.goal_world, jumps.heading), -1, 0)
+    ahead, left = np.moveaxis(turn_plane(jumps.rest_position - jumps.goal_world, -jumps.heading), -1, 0)
     apex_error, distance_at_rest = known(jumps.apex - jumps.goals[..., 2]), goal_distance(jumps.rest_position)
     off = np.where(to_height, np.abs(apex_error), distance_at_rest)
     reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
@@ -327,7 +322,7 @@ class JumpLog(EvaluationLog):
     @property
     def landing(self) -> np.ndarray:
         """Base position at the end of each jump [m], in the frame of the goal's x and y, (..., 2)."""
-        return self.goals[..., :2] + from_world(self.end_position - self.goal_world, self.heading)
+        return self.goals[..., :2] + turn_plane(self.end_position - self.goal_world, -self.heading)
 
     @property
     def ends(self) -> np.ndarray:
@@ -387,12 +382,6 @@ class JumpLog(EvaluationLog):
         """Return the first goals of some worlds in metres: "0.90 m" up or ahead, or "(0.80, 0.20) m" ahead and left."""
         goals = self.goals[list(worlds), 0]
         return [f"{x + height:.2f} m" if y == 0.0 else f"({x:.2f}, {y:.2f}) m" for x, y, height in goals]
-
-
-def yaw_of(quat: np.ndarray) -> np.ndarray:
-    """Return the yaw [rad], (...), of quaternions (..., 4), xyzw: angle of body x in the world plane, from world x."""
-    x, y, z, w = np.moveaxis(quat, -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:

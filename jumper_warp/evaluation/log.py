@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
 from jumper_warp.utils.progress import phase
@@ -131,11 +130,6 @@ def check(condition: bool, message: str) -> None:
     """Raise InputError with the message unless the condition holds."""
     if not condition:
         raise InputError(message)
-
-
-def termination_names(task: TaskCfg) -> tuple[str, ...]:
-    """Return the names of a task's terminations, in the order in which they are checked."""
-    return tuple(term.name for term in task.terminations)
 
 
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:

@@ -127,11 +127,6 @@ def peak_forces(sim: Simulation) -> np.ndarray:
     return direction * sim.physics.peak_paw_force.numpy().T[..., None]
 
 
-def largest_forces(forces: np.ndarray) -> np.ndarray:
-    """Return the largest force [N] on each paw in several physics steps, (4, 3); forces: (steps, 4, 3)."""
-    return forces[np.linalg.norm(forces, axis=2).argmax(axis=0), np.arange(forces.shape[1])]
-
-
 def ankles(poses: np.ndarray) -> np.ndarray:
     """Return ankle positions [m], (num_worlds, 4, 3), world frame, legs FL, FR, BL, BR; poses: (num_worlds, 21, 7)."""
     shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]  # the base, then five links per leg, the inner shank last

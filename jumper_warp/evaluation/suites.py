@@ -15,13 +15,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import TOLERANCE, JumpLog, JumpOutcome, from_world
+from jumper_warp.evaluation.jumps import TOLERANCE, JumpLog, JumpOutcome
 from jumper_warp.evaluation.log import check, within
 from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
+from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
@@ -156,7 +157,7 @@ class Consecutive(Suite):
                 positions.append(np.where(running[:, None], log.arrays["base_pos"][:, :2], np.nan))
 
             logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=add_positions))
-            paths.append(from_world(np.stack(positions, axis=1), logs[-1].headings[:, None]))
+            paths.append(turn_plane(np.stack(positions, axis=1), -logs[-1].headings[:, None]))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
         plot_paths(run.folder / "paths.png", parts, PAIRS, words)

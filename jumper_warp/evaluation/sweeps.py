@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.jump_flags import HEIGHT_PAPER, PLACE_PAPER, HeightFlags, LandingFlags
-from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
+from jumper_warp.evaluation.jump_metrics import HEIGHT_PAPER, PLACE_METRICS, PLACE_PAPER, HeightFlags, LandingFlags
 from jumper_warp.evaluation.jumps import (
     DELAY,
     REST_TIME,
@@ -22,7 +21,7 @@ from jumper_warp.evaluation.jumps import (
     with_second_takeoff,
 )
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
-from jumper_warp.evaluation.log import check, termination_names, within
+from jumper_warp.evaluation.log import check, within
 from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.tasks.cfg import TaskCfg
@@ -85,7 +84,7 @@ class Suite(EvaluationArgs, ABC):
         """
         env = run.env(len(goals)) if env is None else env
         headings = random_headings(len(goals), self.stream_seed) if headings is None else headings
-        log = JumpLog(goals, termination_names(env.task), headings, delay, self.rest_time)
+        log = JumpLog(goals, env.task.termination_names, headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import tyro
 from numpy.typing import ArrayLike
 
-from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.log import EvaluationLog, check, listed, termination_names
+from jumper_warp.evaluation.jumps import wrapped
+from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
-from jumper_warp.utils.rotations import CONJUGATE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -41,8 +41,6 @@ class VelocityLog(EvaluationLog):
     times: np.ndarray = field(default_factory=lambda: np.zeros(1))  # [s] (commands,) Time of each command, first 0
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
     slew: np.ndarray | float = np.inf  # [m/s^2], [rad/s^2] (robots,) Rate at which commands change, from 0 at the start
-    kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
-    kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
     """Measured velocity in the components of `commands`, one array (robots, 3) per policy step."""
     end: np.ndarray = field(init=False)  # (robots,) Index of the termination of a fall, -1 if not fallen
@@ -85,7 +83,7 @@ class VelocityLog(EvaluationLog):
         return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return base state and termination of the robots for `update`, and set due commands and kicks.
+        """Return base state and termination of the robots for `update`, and set due commands.
 
         Keys: base_pos, base_quat (xyzw), base_vel, base_ang_vel (world axes), termination.
         """
@@ -98,12 +96,6 @@ class VelocityLog(EvaluationLog):
         if (changed := (command != self._command).any(axis=1)).any():
             env.command(command, changed)
         self._command = command
-        if self.kick is not None and self.kick_time is not None:
-            kicked = np.round(self.kick_time / env.step_dt).astype(int) == step
-            if kicked.any():
-                rates = qd.copy()
-                rates[kicked, :2] += self.kick[kicked]
-                sim.state.joint_qd.assign(rates.ravel())
         return arrays
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -126,7 +118,7 @@ class VelocityLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Outcome of each robot, (robots,): name of the termination by which it fell, `walked` if it did not fall."""
-        return np.array([*termination_names(self.task), "walked"])[self.end]
+        return np.array([*self.task.termination_names, "walked"])[self.end]
 
     def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3); NaN after a fall."""
@@ -146,7 +138,7 @@ class VelocityLog(EvaluationLog):
 
     def columns(self) -> dict[str, list]:
         """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over the walk, end."""
-        total, count = np.moveaxis(self.square_errors(settled=False), -1, 0)
+        total, count = np.moveaxis(square_sums(self.errors()), -1, 0)
         error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
@@ -159,13 +151,6 @@ class VelocityLog(EvaluationLog):
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
                 "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
-
-    def square_errors(self, *, settled: bool) -> np.ndarray:
-        """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2).
-
-        settled: see `errors`.
-        """
-        return square_sums(self.errors(settled=settled))
 
     def errors(self, *, settled: bool = False) -> np.ndarray:
         """Return the tracking errors, velocity minus command, (steps, robots, 3); NaN after a fall.
@@ -225,21 +210,19 @@ def square_sums(error: np.ndarray) -> np.ndarray:
     return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
-def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
-    """Return the definitions of the RMS tracking errors of each axis as metrics of a `VelocityLog`.
-
-    Keys: `<prefix>rmse_<axis>_<unit>`; over: name of a set of its robots, in `VelocityLog.trials`.
-    """
-    keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
-    return [
-        Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)
-    ]
-
-
+RMSE_ROWS = (
+    ("", "robots with commands at once", False), ("settled_", "robots with commands at once", True),
+    ("slewed_", "robots with slewed commands", False),
+)  # fmt: skip
+"""Prefix, trials and argument `settled` of `VelocityLog.errors`, of each set of tracking errors."""
 VELOCITY_METRICS = (
-    *rmse_rows("", "robots with commands at once", settled=False),
-    *rmse_rows("settled_", "robots with commands at once", settled=True),
-    *rmse_rows("slewed_", "robots with slewed commands", settled=False),
+    *(
+        Metric(
+            f"{prefix}rmse_{axis}_{unit}", rmse, over, lambda o, i=i, s=settled: square_sums(o.errors(settled=s))[:, i]
+        )
+        for prefix, over, settled in RMSE_ROWS
+        for i, (axis, unit) in enumerate(zip(AXES, UNITS, strict=True))
+    ),
     Metric("standing_drift_mean_m", mean, "robots that stood to the end", lambda o: o.distance),
     Metric("standing_turn_abs_mean_deg", mean, "robots that stood to the end", lambda o: abs(np.degrees(o.yaw))),
     Metric("fall_rate", rate, "robots", lambda o: o.fallen),

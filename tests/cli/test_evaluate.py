@@ -6,7 +6,7 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
-from jumper_warp.evaluation.jump_flags import HeightFlags, LandingFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
 from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
 from jumper_warp.evaluation.run import write_trials
 from jumper_warp.policies.folder import save_policy

@@ -186,7 +186,7 @@ def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, num_recorded=0, out=tmp_path, device="cpu")
     run = EvaluationRun.from_args("test", args)
     env = run.env(2)
-    log = JumpLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    log = JumpLog(np.array([[[0.5, 0.0]]] * 2), env.task.termination_names)
     run.run_episodes(env, log)
     values = run.report({}, {})
     assert (values["latency_requested_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")

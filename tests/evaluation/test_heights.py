@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.jump_flags import HeightFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from metric_helpers import values
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jumper_warp.evaluation.jump_flags import HeightFlags, LandingFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog
 from jumper_warp.policies.conditions import Conditions

@@ -17,7 +17,7 @@ from experiments import (
     soak_test,
 )
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jump_flags import HeightFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within

@@ -10,7 +10,7 @@ import torch
 
 from experiments import paper_tests
 from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
     BasePaths,
@@ -237,7 +237,7 @@ def hops():
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
     landings = JumpLog(
-        goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
+        goals, env.task.termination_names, headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
     script = HopPolicy()
 
