@@ -81,11 +81,6 @@ class AttitudeLog(EvaluationLog):
         return bool(self.diverged.all())
 
     @property
-    def angle(self) -> np.ndarray:
-        """Commanded angle of each turn [rad], (num_envs,)."""
-        return 2.0 * np.arctan2(np.linalg.norm(self.turns[:, :3], axis=1), np.abs(self.turns[:, 3]))
-
-    @property
     def error(self) -> np.ndarray:
         """Angle to the goal at the end [rad], (num_envs,)."""
         return self.errors[-1]

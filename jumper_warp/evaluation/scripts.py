@@ -79,23 +79,13 @@ def _step(index: int, item: Any) -> ScriptStep:
         raise InputError(f"{where}: {kind} has no {sorted(map(str, unknown))[0]!r:.40}")
     value = item[kind]
     values = _numbers(f"{where}: {kind}", value if isinstance(value, list) else [value], KINDS[kind], LIMITS[kind])
-    if kind == "stand":
-        return ScriptStep("stand", seconds=_seconds(where, values[0]))
-    if kind == "walk":
-        return ScriptStep("walk", values, _seconds(where, item.get("seconds", 2.0)))
-    if kind == "jump_up" and not values[0] > 0.0:
-        raise InputError(f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
-    return ScriptStep(kind, values)
-
-
-def _seconds(where: str, value: Any) -> float:
-    """Check and return a duration [s] in a script: positive, at most MAX_SECONDS. Raises InputError.
-
-    where: prefix of messages.
-    """
-    (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
+    if kind.startswith("jump"):
+        check(kind != "jump_up" or values[0] > 0.0, f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
+        return ScriptStep(kind, values)
+    time = values[0] if kind == "stand" else item.get("seconds", 2.0)
+    (seconds,) = _numbers(f"{where}: seconds", [time], 1, MAX_SECONDS)
     check(seconds > 0.0, f"{where}: seconds must be positive, got {seconds:g}")
-    return seconds
+    return ScriptStep(kind, values if kind == "walk" else (0.0, 0.0, 0.0), seconds)
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:

@@ -150,19 +150,23 @@ class Consecutive(Suite):
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
         logs, paths = [], []
         for name, goals in (("pairs", pairs), ("row", rows)):
-            positions, delay = [], rng.uniform(*DELAYS, len(goals))
-
-            def add_positions(log: JumpLog, positions: list[np.ndarray] = positions) -> None:
-                running = log.current < log.goals.shape[1]  # NaN for worlds whose last jump has ended
-                positions.append(np.where(running[:, None], log.arrays["base_pos"][:, :2], np.nan))
-
-            logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=add_positions))
+            positions: list[np.ndarray] = []
+            logs.append(self.run_landings(
+                run, goals, delay=rng.uniform(*DELAYS, len(goals)), film=name,
+                on_step=lambda log, to=positions: to.append(running_positions(log)),
+            ))  # fmt: skip
             paths.append(turn_plane(np.stack(positions, axis=1), -logs[-1].headings[:, None]))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
         plot_paths(run.folder / "paths.png", parts, PAIRS, words)
         run.settings["jumps_in_a_row"] = self.jumps_per_trial
         return consecutive_metrics(*logs)
+
+
+def running_positions(jumps: JumpLog) -> np.ndarray:
+    """Return the current base positions x, y [m], (worlds, 2), world frame; NaN if a world's last jump has ended."""
+    running = jumps.current < jumps.goals.shape[1]
+    return np.where(running[:, None], jumps.arrays["base_pos"][:, :2], np.nan)
 
 
 def consecutive_metrics(pairs: JumpLog, row: JumpLog) -> Metrics:

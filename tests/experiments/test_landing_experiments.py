@@ -13,13 +13,13 @@ from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
-    BasePaths,
     Consecutive,
     Farthest,
     Grid,
     Platform,
     consecutive_metrics,
     distance_metrics,
+    running_positions,
 )
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -28,6 +28,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import format_value
 from jumper_warp.utils.output import read_values
+from jumper_warp.utils.rotations import turn_plane
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values
 
@@ -124,17 +125,17 @@ def test_row_without_fall_may_miss_goals():
     assert (metrics["row_all_landed_rate"], metrics["row_all_success_rate"]) == (1.0, 0.5)
 
 
-def test_base_paths_are_in_start_frame():
-    base_paths = BasePaths()
+def test_positions_of_bases_are_those_of_running_rows():
     landings = JumpLog(np.zeros((2, 1, 2)), TERMINATIONS)
-    for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
-        landings.arrays = {"base_pos": np.array([place, place])}
-        base_paths(landings)
+    landings.arrays = {"base_pos": np.array([[0.0, 1.0, 0.3], [0.0, 1.0, 0.3]])}
     landings.current[1] = 1
-    base_paths(landings)
-    paths = base_paths.in_start_frame(np.array([0.5 * math.pi, 0.0]))
-    assert paths[0] == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]))
-    assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
+    positions = running_positions(landings)
+    assert positions[0] == pytest.approx([0.0, 1.0]) and np.isnan(positions[1]).all()
+
+
+def test_vectors_turn_about_z():
+    turned = turn_plane(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([-0.5 * math.pi, 0.5 * math.pi]))
+    assert turned == pytest.approx(np.array([[1.0, 0.0], [0.0, 1.0]]))
 
 
 def bin_log(middle, *, clean, stepped=0, hopped=0):
