@@ -206,11 +206,14 @@ class DistanceSweep(Sweep):
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
-    def measure(self, run: EvaluationRun) -> Metrics:
-        """Run the jumps, plot reached over commanded distance, and return the metrics.
+    def metrics(self, log: JumpLog) -> Metrics:
+        """Return the metrics of `jumper evaluate`, and the success rate over the paper's range of training."""
+        inside, success = within(log.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
+        note = "over 0.4 to 1 m"
+        return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 
-        Those of `jumper evaluate`, and the success rate over the paper's range of training.
-        """
+    def measure(self, run: EvaluationRun) -> Metrics:
+        """Run the jumps, plot reached over commanded distance, and return the metrics."""
         run.settings["end_at_second_takeoff"] = self.end_at_second_takeoff
         change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
         landings = self.run_sweep(run, run.env(self.num_jumps, change), "jumps")
@@ -222,6 +225,4 @@ class DistanceSweep(Sweep):
             labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
-        inside, success = within(landings.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
-        values = measure(success, landings.outcome, inside, "paper_training_range_", "over 0.4 to 1 m")
-        return self.flags.metrics(landings) | values | self.pushed_in_flight(run, change)
+        return self.metrics(landings) | self.pushed_in_flight(run, change)
