@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
+from jumper_warp.evaluation.attitude import DIRECTIONS, TURN_METRICS, AttitudeFlags, AttitudeLog, random_turns
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.utils.metrics import measure
 from jumper_warp.viz.plots import figure
 from support.momentum import MomentumRecorder, rotational_inertia
 from support.scripts import run_script
@@ -74,7 +75,7 @@ def main(args: Args) -> dict:
     plot_turns(run, turns, f"{run.title}, {args.num_turns} turns by {args.angle:g} degrees")
     others = AttitudeLog(random_turns(args.num_turns, args.angle, args.stream_seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)
-    values |= turn_metrics(others, "any_axis_", "about any axis")
+    values |= measure(TURN_METRICS, others, prefix="any_axis_", note="about any axis")
     return run.report(values, HARDWARE, SUMMARY)
 
 

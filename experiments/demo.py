@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import open_loop_jump
-from jumper_warp.evaluation.landings import LandingLog, LandingPlayFlags
+from jumper_warp.evaluation.jump_metrics import LandingPlayFlags
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun
@@ -38,7 +39,7 @@ class Args(DeviceArgs):
     size: tuple[int, int] = (854, 480)  # [px] Width and height of the film
 
 
-def film_jump(args: Args, folder: Path) -> LandingLog:
+def film_jump(args: Args, folder: Path) -> JumpLog:
     """Let a policy jump once, write picture, recording and film `jump.*`, and return the log."""
     run = EvaluationRun("horizontal_jump")
     run.prepare("demo", Conditions(device=args.device), folder)

@@ -20,8 +20,7 @@ from PIL import Image
 from jumper_warp.evaluation.attitude import AttitudePlayFlags
 from jumper_warp.evaluation.courses import CourseLog
 from jumper_warp.evaluation.evaluations import PlayFlags
-from jumper_warp.evaluation.heights import HeightPlayFlags
-from jumper_warp.evaluation.landings import LandingPlayFlags
+from jumper_warp.evaluation.jump_metrics import HeightPlayFlags, LandingPlayFlags
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun

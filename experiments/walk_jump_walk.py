@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.landings import random_headings
+from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import PAPER
@@ -99,7 +99,7 @@ def scripts(args: Args) -> list[list[ScriptStep]]:
 def main(args: Args) -> dict:
     """Simulate robots that walk and jump by scripts, plot the course of robot 0, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
-    run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
+    run = SkillRun(SkillNames(args.policy, args.jump_up, args.jump_to)).prepare_from(name, args)
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))
     course.warn_beyond_training(run.skills.tasks)
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.evaluation.landings import random_headings
+from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile

@@ -42,7 +42,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
     )),
     "evaluation": ("Evaluation", (
         "evaluation.run", "evaluation.evaluations", "evaluation.log", "evaluation.commands", "evaluation.suites",
-        "evaluation.sweeps", "evaluation.episodes", "evaluation.heights", "evaluation.landings",
+        "evaluation.sweeps", "evaluation.episodes", "evaluation.jump_metrics",
         "evaluation.velocities", "evaluation.attitude", "evaluation.jumps", "evaluation.courses",
         "evaluation.scripts", "evaluation.recorder", "evaluation.limits", "evaluation.finetuning",
         "evaluation.finetuning_cfg",

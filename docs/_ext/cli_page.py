@@ -18,8 +18,7 @@ from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
-from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
-from jumper_warp.evaluation.dumps import DumpCfg
+from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import make_task

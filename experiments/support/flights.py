@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.jumps import DELAY, jump_commands
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_config
 from jumper_warp.policies.policy import Policy
@@ -27,6 +27,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
+from jumper_warp.utils.rotations import yaw_of
 from jumper_warp.viz.plots import figure
 from support.momentum import momentum
 
@@ -38,7 +39,7 @@ HIGH = 0.7  # [m] Base height above which no paw can touch level ground
 UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
 CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
 AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
-OUTCOMES = tuple(outcome_names([term.name for term in FALLS_FROM_FLIGHT], "landed", "tilted", "no_takeoff").tolist())
+OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
 """Outcomes by index `FlightLog.end`."""
 LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 """Sides of the legs FL, FR, BL, BR: 1 front or left, -1 back or right; columns: front, left."""
@@ -185,15 +186,11 @@ class FlightLog(EvaluationLog):
             "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
             "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
         }  # fmt: skip
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last tilt [deg] and base height [m] of some worlds."""
-        series = {}
-        for world in worlds:
-            series[f"tilt/of {world} [deg]"] = float(np.degrees(self.tilts[-1][world]))
-            series[f"height/base of {world} [m]"] = float(self.heights[-1][world])
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the last tilt [deg] and base height [m] of all worlds."""
+        return {"tilt/of {} [deg]": np.degrees(self.tilts[-1]), "height/base of {} [m]": self.heights[-1]}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return commanded heights `asked_m` and delays of the extension `late_ms` (front, left) of some worlds."""

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.identification.excitation import unsafe_reason
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.motions import RecordedMotion
@@ -22,6 +21,7 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.viz.plots import figure
+from support.learning import run_jumps
 
 SPREAD, MOST = 0.7, 1.5  # [1] Standard deviation and limit of sampled parameters, in standard deviations of priors
 HELD_OUT_TORQUE = 16.0  # [N m] Torque limit of the held-out jump
@@ -139,12 +139,12 @@ def policy_errors(name: str, jumps: int, case: Case, result: Identification, fol
         env = env_of_policy(policy, jumps, conditions)
         policy.to(env.device)
         log = run_jumps(policy.act, env, np.linspace(0.5, 1.0, jumps))
-        apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(log.reached))
+        apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(log.outcome.reached))
     errors = {
         f"policy_apex_error_{robot}_m": float(np.mean(np.abs(apex[robot] - apex["true"])))
         for robot in ("described", "identified")
     }
-    return {"policy_error_on_true_m": float(np.mean(np.abs(apex["true"] - log.commanded)))} | errors | success
+    return {"policy_error_on_true_m": float(np.mean(np.abs(apex["true"] - log.goals[..., 2])))} | errors | success
 
 
 def plot_cases(rows: list[dict[str, float]], path: Path) -> None:

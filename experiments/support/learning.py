@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.evaluation.heights import run_jumps
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.ppo import Ppo
@@ -48,6 +49,13 @@ class LearningCurve:
 def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
     """Return a nominal environment of `jumps` worlds to evaluate policies of a task, without noise and link margins."""
     return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
+
+
+def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> JumpLog:
+    """Run one jump per world to commanded heights [m], (num_envs,), return the log; act: see `run_evaluation`."""
+    jumps = JumpLog(heights, env.task.termination_names)
+    run_evaluation(act, env, jumps)
+    return jumps
 
 
 def success_rate(trainer: Ppo | Shac, eval_env: Env, heights: tuple[float, float] = TEST_HEIGHTS) -> float:

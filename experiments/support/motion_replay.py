@@ -13,7 +13,7 @@ import warp as wp
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
-from jumper_warp.evaluation.recorder import ankles, largest_forces
+from jumper_warp.evaluation.recorder import ankles
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS
@@ -22,7 +22,7 @@ from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Problem, SimulatedMotion
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
-from support.open_loop import plot_motors
+from support.open_loop import largest_forces, plot_motors
 
 CONTACT_FORCE = 0.1  # [N] Force above which a paw is in contact
 TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff

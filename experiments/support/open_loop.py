@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
-from jumper_warp.evaluation.recorder import ankles, largest_forces
+from jumper_warp.evaluation.recorder import ankles
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.viz.plots import figure
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 STAND, LAND = 60, 60  # Numbers of policy steps in the default pose before and after the jump
 SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the command filter does not let the legs reach
+
+
+def largest_forces(forces: np.ndarray) -> np.ndarray:
+    """Return the largest force [N] on each paw in several physics steps, (4, 3); forces: (steps, 4, 3)."""
+    return forces[np.linalg.norm(forces, axis=2).argmax(axis=0), np.arange(forces.shape[1])]
 
 
 def transversal_command(tick: int, squat: float = SQUAT) -> float:

@@ -13,9 +13,8 @@ import numpy as np
 
 from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.evaluations import EVALUATIONS
-from jumper_warp.evaluation.heights import HeightLog
-from jumper_warp.evaluation.landings import LandingLog
-from jumper_warp.evaluation.log import EvaluationLog, run_evaluation, termination_names
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.suites import Grid
 from jumper_warp.evaluation.velocities import SLEW_RATE, VELOCITY_METRICS, VelocityLog
@@ -93,12 +92,12 @@ def goals_of_test(test: str, num_jumps: int) -> np.ndarray:
 def make_log(task: TaskCfg, test: str, num_jumps: int) -> EvaluationLog:
     """Return a new log of a test; jumps to places are commanded at once, since their goals are always observed."""
     if test == "sweep":
-        return HeightLog(np.linspace(*HEIGHTS, num_jumps), termination_names(task))
+        return JumpLog(np.linspace(*HEIGHTS, num_jumps), task.termination_names)
     if test == "walk":
         commands = np.tile(np.array(WALK), (num_jumps, 1, 1))
         times = COMMAND_TIME * np.arange(len(WALK))
         return VelocityLog(commands, task, COMMAND_TIME * len(WALK), times=times, slew=SLEW_RATE)
-    return LandingLog(goals_of_test(test, num_jumps), termination_names(task), delay=0.0)
+    return JumpLog(goals_of_test(test, num_jumps), task.termination_names, delay=0.0)
 
 
 def names_of_tests(task: TaskCfg) -> tuple[str, ...]:

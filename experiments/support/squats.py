@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,14 +87,10 @@ class SquatLog(EvaluationLog):
         """Return lists with one value per robot not ended: paw_force_range_n, torque_ripple_nm."""
         return {"paw_force_range_n": self.force_range.tolist(), "torque_ripple_nm": self.torque_ripple.tolist()}
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last force [N] on every paw of some worlds."""
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the last force [N] on every paw of all worlds."""
         names = ("front left", "front right", "back left", "back right")
-        return {
-            f"force/{name} of {world} [N]": float(self.forces[-1][world, paw])
-            for world in worlds
-            for paw, name in enumerate(names)
-        }
+        return {f"force/{name} of {{}} [N]": self.forces[-1][:, paw] for paw, name in enumerate(names)}
 
 
 def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:

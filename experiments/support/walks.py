@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from jumper_warp.envs.env import Env
@@ -39,12 +41,30 @@ def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
     return VelocityLog(commands, env.task, RAMP + 1.0 + KEEP, times=times), direction
 
 
-def kicked_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
+@dataclass(kw_only=True)
+class KickedWalks(VelocityLog):
+    """Log of walks in which the velocity of each base has a step change."""
+
+    kick_time: np.ndarray  # [s] (robots,) Time of the step change
+    kick: np.ndarray  # [m/s] (robots, 2) Step change of the velocity, world axes
+
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
+        """Return the arrays of `VelocityLog.read_env`, and set due kicks."""
+        arrays = super().read_env(env)
+        kicked = np.round(self.kick_time / env.step_dt).astype(int) == len(self.velocity) + 1
+        if kicked.any():
+            rates = env.sim.joint_qd().copy()
+            rates[kicked, :2] += self.kick[kicked]
+            env.sim.state.joint_qd.assign(rates.ravel())
+        return arrays
+
+
+def kicked_walks(env: Env, rng: np.random.Generator) -> KickedWalks:
     """Return a new log of walks of 7 s with a random command and a kick in a random direction after 2 to 4 s."""
     n = env.num_envs
     commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return VelocityLog(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
+    return KickedWalks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
 
 
 def speed_metrics(walks: VelocityLog, direction: np.ndarray) -> Metrics:

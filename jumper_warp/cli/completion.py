@@ -76,8 +76,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are the flags of a command, for tasks of any kind."""
     from jumper_warp.cli import doctor, export, info, list, sysid, train
-    from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
-    from jumper_warp.evaluation.dumps import DumpCfg
+    from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import EVALUATIONS
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
 

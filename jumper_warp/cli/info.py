@@ -186,5 +186,5 @@ def contents_of(task: TaskCfg) -> dict[str, Any]:
         "observations": [term.name for term in task.observations.actor],
         "action_size": 12,
         "rewards": {term.name: term.numbers["weight"] for term in task.rewards},
-        "terminations": [term.name for term in task.terminations],
+        "terminations": [*task.termination_names],
     }

@@ -30,7 +30,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     names = {arg.partition("=")[0] for arg in args} if args and args[0].startswith("-") else set()
     if DUMP in names:
-        from jumper_warp.evaluation.dumps import DumpCfg, play_dump
+        from jumper_warp.evaluation.commands import DumpCfg, play_dump
 
         play_dump(parse_flags(DumpCfg, f"play {DUMP} FILE", args))
         return

@@ -74,7 +74,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"Gymnasium's adapter needs an environment of one task, this one has {len(env.tasks)}")
         self.env, self.num_envs, self.device = env, env.num_envs, env.device
         self.metadata = {**RENDERING, "autoreset_mode": self.autoreset_mode}
-        self.endings = tuple(term.name for term in env.task.terminations)
+        self.endings = env.task.termination_names
         self._all_groups, self.tensors, self._was_reset = all_groups, tensors, False
         self.render_mode, self._size, self._drawn = render_mode, render_size, min(render_envs, self.num_envs)
         self._to_reset = None if self.autoreset_mode is AutoresetMode.SAME_STEP else env.use_reset_mask()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, finite
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
@@ -81,11 +81,6 @@ class AttitudeLog(EvaluationLog):
         return bool(self.diverged.all())
 
     @property
-    def angle(self) -> np.ndarray:
-        """Commanded angle of each turn [rad], (num_envs,)."""
-        return 2.0 * np.arctan2(np.linalg.norm(self.turns[:, :3], axis=1), np.abs(self.turns[:, 3]))
-
-    @property
     def error(self) -> np.ndarray:
         """Angle to the goal at the end [rad], (num_envs,)."""
         return self.errors[-1]
@@ -125,15 +120,12 @@ class AttitudeLog(EvaluationLog):
         """Return lists with one value per turn: turn_x to turn_w, error_deg, first_s, settling_s, end (outcome)."""
         columns = {f"turn_{axis}": self.turns[:, i] for i, axis in enumerate("xyzw")}
         columns |= {"error_deg": np.degrees(self.error), "first_s": self.first_time, "settling_s": self.settling_time}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current angle to the goal [deg] and angular speed [rad/s] of some worlds; NaN is replaced by 0."""
-        series = {}
-        for name, world in zip(self.names(worlds), worlds, strict=True):
-            series[f"error/angle to goal, {name} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
-            series[f"spin/angular speed, {name} [rad/s]"] = float(np.nan_to_num(self.angular_speeds[-1][world]))
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current angle to the goal [deg] and angular speed [rad/s] of all worlds; NaN is replaced by 0."""
+        error, speed = np.nan_to_num(self.errors[-1]), np.nan_to_num(self.angular_speeds[-1])
+        return {"error/angle to goal, {} [deg]": np.degrees(error), "spin/angular speed, {} [rad/s]": speed}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commanded turns of some worlds: key `turns_xyzw`, a list of quaternions."""
@@ -152,14 +144,6 @@ TURN_METRICS = (
     Metric("diverged_rate", rate, "turns", lambda o: o.diverged),
 )
 """Table of the metrics of turns; a turn has settled if its error stays within the tolerance until the end."""
-
-
-def turn_metrics(turns: AttitudeLog, prefix: str = "", note: str = "") -> Metrics:
-    """Return success rate, settling times, errors and failures of a log of turns, the metrics TURN_METRICS.
-
-    prefix, note: see `measure`.
-    """
-    return measure(TURN_METRICS, turns, None, prefix, note)
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
@@ -188,8 +172,7 @@ class AttitudeFlags:
             raise InputError(f"num_turns must be at least {len(DIRECTIONS)}, got {self.num_turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
             raise InputError(f"angle and tolerance must be in (0, 180] degrees, got {self.angle}, {self.tolerance}")
-        if not 0.1 <= self.seconds <= 60.0:
-            raise InputError(f"seconds must be in [0.1, 60], got {self.seconds}")
+        check(0.1 <= self.seconds <= 60.0, f"seconds must be in [0.1, 60], got {self.seconds}")
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the log of the turns, one per world; task and seed have no effect."""
@@ -197,7 +180,7 @@ class AttitudeFlags:
 
     def metrics(self, log: AttitudeLog) -> Metrics:
         """Return the metrics of a finished log of turns, together and for each axis and direction."""
-        return turn_metrics(log) | axis_metrics(log)
+        return measure(TURN_METRICS, log) | axis_metrics(log)
 
 
 @dataclass(frozen=True)
@@ -209,8 +192,7 @@ class AttitudePlayFlags:
     length = 4.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.angle <= 180.0:
-            raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
+        check(0.0 < self.angle <= 180.0, f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:
         """Return the log of six turns, one per robot, in the order of DIRECTIONS; task has no effect."""

@@ -57,15 +57,21 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
     than reporting; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.trained import trained_success
     from jumper_warp.policies.folder import add_files
     from jumper_warp.policies.runs import is_run
+    from jumper_warp.registry import of_project
 
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
     run.print_flags = cfg.printing
-    values = run.evaluate(cfg.flags, cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
+    run.run_episodes(run.env(log.count), log)
+    metrics = cfg.flags.metrics(log) | trained_success(run.task, log)
+    values = run.report(metrics, run.evaluation.paper if of_project(run.task.name) else {})
     if cfg.save_to_policy:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
         add_files(find_policy(run.source), files)
@@ -225,9 +231,62 @@ def show_recording(
     films = [] if cfg.film.video is None else [cfg.film.write(recording)]
     run.print_flags = cfg.printing
     run.summarise(count, keys, trial=name, films=films)
-    if cfg.viewer == "rerun":
-        subprocess.run(viewer_command(path), check=False)
+    open_viewer(path, cfg.viewer)
     return path
+
+
+@dataclass(frozen=True)
+class DumpCfg:
+    """Show the state in which a term of a training was not finite: write a recording and a picture of the robot."""
+
+    dump: Path  # File that the training has written, RUN/non_finite/TERM.npz
+    out: Path | None = None  # Folder for the results (default: outputs/play/<time>)
+    viewer: Literal["none", "rerun"] = "none"
+    """Open the recording in Rerun's viewer. It listens on this machine's loopback address only."""
+
+
+def play_dump(cfg: DumpCfg) -> Path:
+    """Write a recording of one frame and a picture of the state in a dump, and print its values; return the recording.
+
+    The robot is shown on level ground. Raises InputError: the file is no dump; OSError: the folder cannot be created.
+    """
+    import numpy as np
+
+    from jumper_warp.utils.dumps import load_dump
+
+    found, header = load_dump(cfg.dump)
+    from jumper_warp.evaluation.recorder import ankles, save_recording
+    from jumper_warp.sim.links import LinkReader
+    from jumper_warp.sim.simulation import Simulation
+    from jumper_warp.utils.output import output_dir
+    from jumper_warp.utils.runtime import configure_device
+    from jumper_warp.viz.recorder import Recorder
+
+    configure_device("cpu")
+    sim = Simulation(1, device="cpu")
+    sim.state.joint_q.assign(np.nan_to_num(found.arrays["joint_q"], posinf=0.0, neginf=0.0))
+    sim.state.joint_qd.assign(np.nan_to_num(found.arrays["joint_qd"], posinf=0.0, neginf=0.0))
+    poses = LinkReader(sim).read()[0]
+    units = {name: zip(found.names[name], found.arrays[name], strict=True) for name in ("rewards", "observations")}
+    series = {f"{group}/{name} [1]": float(value) for group, values in units.items() for name, value in values}
+    notes = {"task": header["task"], "term": found.term, "world": found.world, "step": found.step}
+    recorder = Recorder(sim.model, notes=notes, labels=[f"{found.term}, world {found.world}, step {found.step}"])
+    recorder.record(0.0, poses.reshape(-1, 7), series, ankles(poses), np.zeros((1, 4, 3)))
+    folder = output_dir("play", cfg.out)
+    path = save_recording(recorder.recording(), folder, "dump")
+    print(f"{header['task']}, iteration {header['iteration']}, seed {header['config']['train']['seed']}: {found}")
+    for name in ("rewards", "observations"):
+        bad = np.array(found.names[name])[~np.isfinite(found.arrays[name])]
+        print(f"{name} that are not finite: {', '.join(bad) or 'none'}")
+    print(path)
+    open_viewer(path, cfg.viewer)
+    return path
+
+
+def open_viewer(path: Path, viewer: str) -> None:
+    """Open a recording in the viewer of this name, `rerun` or `none`."""
+    if viewer == "rerun":
+        subprocess.run(viewer_command(path), check=False)
 
 
 def viewer_command(path: Path) -> list[str]:

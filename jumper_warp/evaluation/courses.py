@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.jumps import updated_apex
-from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
@@ -37,13 +37,8 @@ from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
 
-SKILLS = {
-    "walk": WALK,
-    "stand": WALK,
-    "jump_up": JUMP_UP,
-    "jump_to": JUMP_TO,
-    "jump_onto": JUMP_TO,
-}  # By kind of command
+SKILLS = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
+"""Skill of each kind of command."""
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
 """Block to jump onto, initially 1 km away on both axes; it is moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
@@ -51,11 +46,11 @@ NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period and duration of the steps of 
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
-OUTCOMES = tuple(outcome_names([term.name for term in FALLS], "stuck", "done").tolist())
+OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
 GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {JUMP_UP: "C4", JUMP_TO: "C3"}  # Shades of plots, by skill
-NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
+NAMES = ("walk", "jump up", "jump to")  # By skill
 
 
 @dataclass
@@ -99,6 +94,11 @@ class CourseLog(EvaluationLog):
         self._skill, self._target_velocity, self._command = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
 
     @property
+    def _at(self) -> np.ndarray:
+        """Index of each robot's current command, (robots,); of its last command after the end."""
+        return np.minimum(self.current, self.target_skill.shape[1] - 1)
+
+    @property
     def block(self) -> BlockCfg | None:
         """Block that the scripts' jumps land on, for `Env(block=...)`; None if no command is a jump onto it."""
         return BLOCK if self.onto_block.any() else None
@@ -136,7 +136,7 @@ class CourseLog(EvaluationLog):
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T,
         }  # fmt: skip
         rows = np.arange(len(q))
-        kind = self.target_skill[rows, np.minimum(self.current, self.target_skill.shape[1] - 1)]
+        kind = self.target_skill[rows, self._at]
         for name in ("goal", "phase", "took_off", "touched_down"):
             by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
@@ -146,8 +146,7 @@ class CourseLog(EvaluationLog):
         """Record a policy step, then send due commands and requests; return whether all courses have ended."""
         before, previous = self.current.copy(), self._skill
         ended = super().record_step(env)
-        rows, running = np.arange(len(before)), self.end < 0
-        at = np.minimum(self.current, self.target_skill.shape[1] - 1)
+        rows, at, running = np.arange(len(before)), self._at, self.end < 0
         started, jumping = running & (self.current > before), self.target_skill[rows, at] != WALK
         self._target_velocity[started] = np.where(jumping[started, None], 0.0, self.goal[rows, at][started])
         waited = (len(self.skills) - self.start_step[rows, at]) * self.step_dt
@@ -175,7 +174,7 @@ class CourseLog(EvaluationLog):
 
     def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
         """Request the jump of every robot in `worlds`, (robots,) bool, whose current command is a jump."""
-        rows, at = np.arange(len(worlds)), np.minimum(self.current, self.target_skill.shape[1] - 1)
+        rows, at = np.arange(len(worlds)), self._at
         for skill in (JUMP_UP, JUMP_TO):
             requested = worlds & (self.target_skill[rows, at] == skill)
             if requested.any():
@@ -232,8 +231,7 @@ class CourseLog(EvaluationLog):
         arrays: those of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill
         that was active in the step; step: its number, from 1.
         """
-        rows = np.arange(len(running))
-        at = np.minimum(self.current, self.target_skill.shape[1] - 1)
+        rows, at = np.arange(len(running)), self._at
         alive, walking = running[:, None], (previous == WALK)[:, None]
         self.velocity.append(np.where(alive, body_velocity(arrays), np.nan).astype(np.float32))
         self.commands.append(np.where(alive & walking, self._command, np.nan).astype(np.float32))
@@ -271,41 +269,27 @@ class CourseLog(EvaluationLog):
         near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
 
-    def square_errors(self) -> np.ndarray:
-        """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2), where `is_tracked`."""
-        error = np.array(self.velocity, dtype=float) - np.array(self.commands, dtype=float)
-        error[~np.array(self.is_tracked)] = np.nan
-        return square_sums(error)
-
     def columns(self) -> dict[str, list]:
         """Return results as lists with one value per robot: end, commands done, largest errors of jumps [m].
 
         Keys: end, commands_done, apex_error_m, landing_error_m.
         """
         worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
-        done = {"end": self.outcomes.tolist(), "commands_done": (self.finish_step >= 0).sum(axis=1).tolist()}
-        return done | {name: finite(values) for name, values in worst.items()}
+        return listed({"end": self.outcomes, "commands_done": (self.finish_step >= 0).sum(axis=1)} | worst)
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current velocity, command and base height [m] of some robots."""
-        rows, names = list(worlds), self.names(worlds)
-        series = velocity_series(self.velocity[-1][rows], self.velocity_commands(worlds), names)
-        return series | {
-            f"height/base, {name} [m]": self.height[-1][row] for name, row in zip(names, rows, strict=True)
-        }
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current velocity, command and base height [m] of all robots."""
+        series = velocity_series(self.velocity[-1], self.marks()["commands"])
+        return series | {"height/base, {} [m]": self.height[-1]}
 
-    def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the skill that was active in some robots' last policy step."""
-        skills = self.skills[-1][list(worlds)]
-        return {f"skill/{name}": NAMES[skill] for name, skill in zip(self.names(worlds), skills, strict=True)}
+    def states(self) -> dict[str, np.ndarray]:
+        """Return the skill that was active in all robots' last policy step."""
+        return {"skill/{}": np.array(NAMES)[self.skills[-1]]}
 
-    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the current commands of some robots, (worlds, 3), 0 while a robot does not walk."""
-        return np.nan_to_num(self.commands[-1][list(worlds)])
-
-    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the goals [m] of some robots' jumps, world frame, (worlds, commands, 3), z = 0; NaN for others."""
-        return np.pad(self.goal_world[list(worlds)], ((0, 0), (0, 0), (0, 1)))
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the goals of all robots' jumps, z = 0, NaN for others, and the commands, 0 while it does not walk."""
+        goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
+        return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the scripts of some robots: key `scripts`, lists of [kind, *values]."""
@@ -328,7 +312,9 @@ def course_metrics(course: CourseLog) -> Metrics:
     jumps = course.target_skill != WALK
     made, switched = jumps & (course.takeoff_step >= 0), jumps & (course.switch_step >= 0)
     finished = course.outcomes == "done"
-    squares = course.square_errors()
+    error = np.array(course.velocity, dtype=float) - np.array(course.commands, dtype=float)
+    error[~np.array(course.is_tracked)] = np.nan
+    squares = square_sums(error)
     metrics = {
         "finished_rate": rate(finished, "robots"),
         "finished_on_goal_rate": rate(finished & course.on_goal.all(axis=1), "robots"),

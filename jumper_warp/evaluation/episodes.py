@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import FLOAT32_MAX
@@ -56,17 +56,13 @@ class EpisodeLog(EvaluationLog):
             env.reset()
         arrays = env.task_arrays()
         self.start_position = arrays["base_pos"].copy()
-        self._compare(arrays)
+        self.identical &= rows_are_equal(arrays)
         if self.count == 1 or not self.commands.shape[1]:
             self._start = sampled_numbers(arrays)
 
-    def _compare(self, arrays: dict[str, np.ndarray]) -> None:
-        """Update `identical` from the arrays of `read_env`."""
-        self.identical = self.identical and all(map(rows_are_equal, arrays.values()))
-
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
-        self._compare(arrays)
+        self.identical = self.identical and rows_are_equal(arrays)
         running = self.end < 0
         self.end_position[running] = arrays["base_pos"][running]
         self._height_sum[running] += arrays["base_pos"][running, 2]
@@ -89,7 +85,7 @@ class EpisodeLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Name of the termination of each episode, (num_envs,); NO_END if it has not ended."""
-        return outcome_names([term.name for term in self.task.terminations], NO_END)[self.end]
+        return np.array([*self.task.termination_names, NO_END])[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
         """Return whether each episode ended by a termination with an option, `success` or `time_out`, (num_envs,)."""
@@ -103,15 +99,13 @@ class EpisodeLog(EvaluationLog):
         columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
         columns |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current base height and horizontal distance from the start [m] of some worlds."""
-        series, pos = {}, self.arrays["base_pos"]
-        for name, world in zip(self.names(worlds), worlds, strict=True):
-            series[f"height/base, {name} [m]"] = pos[world, 2]
-            series[f"distance/from start, {name} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
-        return series
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current base height and horizontal distance from the start [m] of all worlds."""
+        pos = self.arrays["base_pos"]
+        distance = np.linalg.norm((pos - self.start_position)[:, :2], axis=1)
+        return {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
         """Return numbers of some worlds, and their commands: "episode 1, command 0.6 0"."""
@@ -123,18 +117,11 @@ class EpisodeLog(EvaluationLog):
         """Return the commands of some worlds: key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
-    def first(self) -> EpisodeLog:
-        """Return a log of the first episode alone."""
-        log = EpisodeLog(self.commands[:1], self.task, self.seconds)
-        for name in ("end", "length", "start_position", "end_position", "_height_sum", "_steps"):
-            setattr(log, name, getattr(self, name)[:1])
-        return log
 
-
-def rows_are_equal(values: np.ndarray) -> bool:
-    """Return whether all rows of an array are equal within rounding, NaN included."""
-    numbers = np.asarray(values, dtype=float)
-    return np.allclose(numbers, numbers[:1], rtol=1e-6, atol=1e-6, equal_nan=True)
+def rows_are_equal(arrays: dict[str, np.ndarray]) -> bool:
+    """Return whether all rows of each array are equal within rounding, NaN included."""
+    numbers = [np.asarray(values, dtype=float) for values in arrays.values()]
+    return all(np.allclose(each, each[:1], rtol=1e-6, atol=1e-6, equal_nan=True) for each in numbers)
 
 
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -144,7 +131,7 @@ def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
     columns = {}
     for name, values in arrays.items():
-        constant = rows_are_equal(values) if len(values) > 1 else not values.any()
+        constant = rows_are_equal({name: values}) if len(values) > 1 else not values.any()
         if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or constant:
             continue
         parts = {f"_{i}": values[:, i] for i in range(values.shape[1])} if values.ndim == 2 else {"": values}
@@ -152,22 +139,21 @@ def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return columns
 
 
-def episode_metrics(episodes: EpisodeLog) -> Metrics:
+def episode_metrics(episodes: EpisodeLog, count: int | None = None) -> Metrics:
     """Return rates of outcomes, and mean length, base height and displacement, of a log of episodes.
 
-    `ended_by_<outcome>_rate` is the rate of a termination.
+    `ended_by_<outcome>_rate` is the rate of a termination. count: number of episodes to measure (default: all).
     """
-    running, over = episodes.end < 0, "episodes"
-    success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
-    displacement, distance = episodes.displacement, np.linalg.norm(episodes.displacement, axis=1)
+    running, over, displacement = episodes.end[:count] < 0, "episodes", episodes.displacement[:count]
+    success, timed_out = (episodes.ended_with(option)[:count] for option in ("success", "time_out"))
     return {
         "success_termination_rate": rate(success, over),
         "failure_termination_rate": rate(~running & ~success & ~timed_out, over),
-        **ended_by(episodes.outcomes, over),
-        "length_mean_s": mean(episodes.length, over),
-        "base_height_mean_m": mean(episodes.mean_height, over),
-        "base_height_at_end_mean_m": mean(episodes.end_position[:, 2], over),
-        "distance_from_start_mean_m": mean(distance, over),
+        **ended_by(episodes.outcomes[:count], over),
+        "length_mean_s": mean(episodes.length[:count], over),
+        "base_height_mean_m": mean(episodes.mean_height[:count], over),
+        "base_height_at_end_mean_m": mean(episodes.end_position[:count, 2], over),
+        "distance_from_start_mean_m": mean(np.linalg.norm(displacement, axis=1), over),
         "moved_x_signed_mean_m": mean(displacement[:, 0], over),
         "moved_y_signed_mean_m": mean(displacement[:, 1], over),
     }
@@ -179,8 +165,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
         raise InputError(f"num_episodes must be at least 1, got {count}")
     if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
-    if not 0.0 < seconds <= MAX_SECONDS:
-        raise InputError(f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
+    check(0.0 < seconds <= MAX_SECONDS, f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
@@ -222,7 +207,7 @@ class EpisodeFlags:
             return episode_metrics(log)
         reason = "nothing was sampled; they count as one trial. --randomize samples robots"
         print(f"jumper: all {log.count} episodes are identical: {reason}", file=sys.stderr)
-        return episode_metrics(log.first())
+        return episode_metrics(log, 1)
 
 
 @dataclass(frozen=True)

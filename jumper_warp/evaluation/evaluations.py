@@ -6,12 +6,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
-from jumper_warp.evaluation import heights, landings, velocities
+from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
-from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
+from jumper_warp.evaluation.jump_metrics import (
+    HEIGHT_PAPER,
+    PLACE_PAPER,
+    HeightFlags,
+    HeightPlayFlags,
+    LandingFlags,
+    LandingPlayFlags,
+)
 from jumper_warp.evaluation.jumps import with_jump_terminations
-from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
 from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
 from jumper_warp.policies.spec import PolicyError
@@ -57,8 +63,8 @@ class Evaluation:
     paper: Mapping[str, float] = field(default_factory=dict)  # Values in the paper of metrics with the same keys
 
 
-HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), with_jump_terminations, "apex", heights.PAPER)
-LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), with_jump_terminations, "landing", landings.PAPER)
+HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), with_jump_terminations, "apex", HEIGHT_PAPER)
+LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), with_jump_terminations, "landing", PLACE_PAPER)
 EVALUATIONS: dict[str, Evaluation] = {
     "apex_height": HEIGHT_EVALUATION,
     "landing_position": LANDING_EVALUATION,

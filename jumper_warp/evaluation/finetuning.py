@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -196,15 +195,6 @@ def tune_weights(
     return history
 
 
-def on_robot(policy: Policy, overlay: Path) -> Policy:
-    """Return a copy of a policy whose configuration holds a robot overlay, so that its environments are of this robot.
-
-    overlay: JSON file. Raises InputError or OSError: it cannot be used.
-    """
-    env = policy.config.get("env", {}) | {"robot": load_overlay(overlay).to_json()}
-    return Policy(policy.layers, policy.mean, policy.std, policy.interface, policy.config | {"env": env})
-
-
 def finetune(
     policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
@@ -214,7 +204,9 @@ def finetune(
     `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """
     begin = time.perf_counter()
-    policy = policy if cfg.robot is None else on_robot(policy, cfg.robot)
+    if cfg.robot is not None:  # environments are of the robot in the policy's configuration
+        env = policy.config.get("env", {}) | {"robot": load_overlay(cfg.robot).to_json()}
+        policy = Policy(policy.layers, policy.mean, policy.std, policy.interface, policy.config | {"env": env})
     groups = make_groups(policy, cfg, modules)
     aims = []
     if not groups[0].to_height:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from jumper_warp.evaluation.log import check
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -43,8 +44,7 @@ class FinetuneCfg:
             check_positive(name, getattr(self, name))
         for name in ("height_range", "distance_range"):
             low, high = getattr(self, name)
-            if not 0.0 < low < high < 10.0:
-                raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
+            check(0.0 < low < high < 10.0, f"{name} must be in (0, 10) m and rise, got {low}, {high}")
 
 
 @dataclass(frozen=True)

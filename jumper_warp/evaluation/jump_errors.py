@@ -67,19 +67,11 @@ class JumpGroup:
         return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
 
-def apex_heights(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
-    """Return the differentiable base heights at the apex [m], in a list with one entry (n,).
-
-    states: of every policy step; steps: indices of the apexes in them, (n,).
-    """
-    return [torch.stack([state.q[2] for state in states]).gather(0, steps[None])[0]]
-
-
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
     """Return the differentiable landing point [m] of the ballistic flight from the apex, [x, y].
 
     Each is (n,), world frame.
-    states, steps: see `apex_heights`. The base lands at LANDING_HEIGHT.
+    states: of every policy step; steps: indices of the apexes in them, (n,). The base lands at LANDING_HEIGHT.
     """
     motions = [loop.motion(state) for state in states]
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
@@ -125,7 +117,8 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
     jacobian = value.new_zeros(0)
     if derivatives:
         steps = torch.as_tensor(apex_step, device=env.device)
-        outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, steps)
+        heights = torch.stack([state.q[2] for state in states]).gather(0, steps[None])
+        outcomes = [heights[0]] if to_height else ballistic_landing(loop, states, steps)
         rows = [per_world_gradients(outcome.sum(), tape) for outcome in outcomes]
         jacobian = torch.cat(rows).nan_to_num(0.0, 0.0, 0.0)
     return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)

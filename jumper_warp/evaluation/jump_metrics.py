@@ -1,16 +1,31 @@
-"""Metrics of jumps to heights and to landing positions, and the common flags of their evaluations."""
+"""Evaluation of jumps to heights and to landing positions: metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
+import tyro
 
-from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome
-from jumper_warp.evaluation.log import within
+from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome, random_headings
+from jumper_warp.evaluation.log import check, within
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
+Position2D = tuple[float, float]  # [m] Ahead and to the left
+HEIGHT_PAPER = {"apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0}
+"""Metrics of the paper's simulation of jumps to heights by key; the paper evaluates the apex only."""
+PLACE_PAPER = {
+    "success_rate": 0.97, "in_range_success_rate": 1.0, "goal_distance_at_rest_mean_m": 0.026,
+    "goal_distance_at_end_mean_m": 0.026,
+}  # fmt: skip
+"""Metrics of the paper's simulation of jumps to landing positions by key."""
+MAX_ROBOTS = 64  # Maximum number of robots in one recording
+JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
@@ -107,3 +122,94 @@ class JumpFlags:
         size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance; the other is 0
         inside = within(size, self.success_range)
         return jump_metrics(outcome) | range_metrics(outcome, inside, f"with goals of {low:g} to {high:g} m")
+
+
+@dataclass(frozen=True)
+class HeightFlags(JumpFlags):
+    """Flags of jumps to evenly spaced heights."""
+
+    success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
+    height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.height_range[0] <= self.height_range[1] < 10.0:
+            raise InputError(f"height_range must be in (0, 10) m and rise, got {self.height_range}")
+
+    def log(self, task: TaskCfg, seed: int) -> JumpLog:
+        """Return a new log of one jump per world to evenly spaced heights; seed has no effect."""
+        return JumpLog(np.linspace(*self.height_range, self.num_jumps), task.termination_names)
+
+
+@dataclass(frozen=True)
+class HeightPlayFlags:
+    """Flags of recorded jumps to heights."""
+
+    height: tuple[float, ...] = (0.6, 0.9, 1.1)  # [m] Commanded base heights, one robot each
+    length: tyro.conf.Suppress[float] = 3.5  # [s] Length of the recording, unless `jumper play --seconds` sets it
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
+            raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
+
+    def log(self, task: TaskCfg) -> JumpLog:
+        """Return a new log of one recorded jump per robot."""
+        return JumpLog(np.array(self.height), task.termination_names)
+
+
+@dataclass(frozen=True)
+class LandingFlags(JumpFlags):
+    """Flags of jumps to landing positions from rest in the default pose."""
+
+    goal_x: tuple[float, float] = (0.3, 1.5)
+    """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
+    goal_y: tuple[float, float] = (0.0, 0.0)
+    """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
+    heading: Literal["any"] | float = "any"  # [deg] Heading of all robots, or any: sampled from the full circle
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("goal_x", "goal_y"):
+            low, high = getattr(self, name)
+            check(-10.0 < low <= high < 10.0, f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
+        if self.heading != "any":
+            check_finite("heading", self.heading)
+
+    def log(self, task: TaskCfg, seed: int) -> JumpLog:
+        """Return a new log of one jump per world, with goals and headings from the flags."""
+        rng = np.random.default_rng(seed)
+        goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
+        headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
+        return JumpLog(goals[:, None], task.termination_names, headings)
+
+
+@dataclass(frozen=True)
+class LandingPlayFlags:
+    """Flags of recorded jumps to landing positions."""
+
+    goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
+    """[m] Goal of a robot, ahead and to the left; repeat the flag for each robot (default: three goals)."""
+    next_goals: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
+    """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; repeat it for each jump."""
+    default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
+    """[m] Goals if `goal` is not passed; a default of `goal` itself would be kept when the flag is passed."""
+
+    def __post_init__(self) -> None:
+        for name in ("goal", "next_goals"):
+            places = getattr(self, name)
+            if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
+                raise InputError(f"{name} takes up to {MAX_ROBOTS} positions in (-10, 10) m, got {places}")
+
+    @property
+    def goals(self) -> tuple[Position2D, ...]:
+        """First goal of each robot [m], ahead and to the left."""
+        return self.goal or self.default_goals
+
+    @property
+    def length(self) -> float:
+        """Length of the recording [s]."""
+        return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.next_goals)
+
+    def log(self, task: TaskCfg) -> JumpLog:
+        """Return the log of the jumps: each robot jumps to its goal of `goals`, then to all `next_goals`."""
+        return JumpLog(np.array([[goal, *self.next_goals] for goal in self.goals]), task.termination_names)

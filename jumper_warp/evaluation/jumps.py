@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import (
-    COLLIDED,
-    DIVERGED,
-    FALLS,
-    NO_END,
-    SUCCESS,
-    EvaluationLog,
-    finite,
-    outcome_names,
-    success_index,
-    with_terminations,
-)
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, listed
+from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -41,11 +33,24 @@ TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 
 
 def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with the terminations of evaluated jumps, TERMINATIONS.
+    """Return a copy of the task with the terminations of evaluated jumps, TERMINATIONS, if it has them, in this order.
 
     Terminations for training are left out.
     """
-    return with_terminations(task, TERMINATIONS)
+    terms = {term.name: term for term in task.terminations}
+    return replace(task, terminations=tuple(terms[name] for name in TERMINATIONS if name in terms))
+
+
+def with_second_takeoff(task: TaskCfg) -> TaskCfg:
+    """Return a copy of a task with the authors' termination at a second takeoff, which precedes success."""
+    task = with_jump_terminations(task)
+    takeoff = TerminationTerm(second_takeoff, speed=TAKEOFF_SPEED)
+    return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
+
+
+def random_headings(count: int, seed: int) -> np.ndarray:
+    """Return uniformly random headings [rad] in -pi..pi, (count,)."""
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, count)
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
@@ -144,8 +149,7 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         """Return the distances of positions (..., 2) from the goals, NaN where the simulation diverged."""
         return known(np.linalg.norm(position - jumps.goal_world, axis=-1))
 
-    x, y = np.moveaxis(jumps.rest_position - jumps.goal_world, -1, 0)
-    cos, sin = np.cos(jumps.heading), np.sin(jumps.heading)
+    ahead, left = np.moveaxis(turn_plane(jumps.rest_position - jumps.goal_world, -jumps.heading), -1, 0)
     apex_error, distance_at_rest = known(jumps.apex - jumps.goals[..., 2]), goal_distance(jumps.rest_position)
     off = np.where(to_height, np.abs(apex_error), distance_at_rest)
     reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
@@ -158,7 +162,7 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         missed=landed & ~reached, no_jump=ends == "no_jump", apex_m=known(jumps.apex),
         apex_error_m=np.where(to_height, apex_error, np.nan), distance_at_end_m=goal_distance(jumps.end_position),
         distance_at_touchdown_m=goal_distance(jumps.touchdown), distance_at_rest_m=distance_at_rest,
-        ahead_m=known(cos * x + sin * y), left_m=known(cos * y - sin * x), drift_m=known(jumps.drift),
+        ahead_m=known(ahead), left_m=known(left), drift_m=known(jumps.drift),
         distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
         paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
         tilt_deg=known(np.degrees(jumps.tilt)), turn_deg=known(np.degrees(np.abs(jumps.yaw))),
@@ -172,10 +176,6 @@ class JumpLog(EvaluationLog):
     and yaw at their command. A jump's entries do not change after its end.
     """
 
-    def all_commands(self) -> np.ndarray:
-        """Return the goals of all jumps [m], (num_envs, jumps in a row, 3)."""
-        return self.goals
-
     def __init__(
         self,
         goals: np.ndarray,
@@ -186,18 +186,26 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Create a log of jumps that have not begun.
 
-        goals [m]: landing positions ahead and to the left, (num_envs, jumps in a row, 2 or 3), third the base height at
-        the apex, 0 for any; terminations: names of the task's terminations, SUCCESS among them; headings [rad]:
-        (num_envs,) or one for all; delay [s]: time until the first jump is commanded, likewise; rest [s]: time from
-        touchdown to the end of the jump and the next command. Raises InputError: another shape, or no SUCCESS.
+        goals [m]: apex heights of the base above the ground, (num_envs,), or landing positions ahead and to the left,
+        (num_envs, jumps in a row, 2 or 3), third the apex height, 0 for any; terminations: names of the task's
+        terminations, SUCCESS among them; headings [rad]: (num_envs,) or one for all; delay [s]: time until the first
+        jump is commanded, likewise; rest [s]: time from touchdown to the end of the jump and the next command. Raises
+        InputError: another shape, or no SUCCESS.
 
         Below, arrays have shape (num_envs, jumps in a row, ...).
         """
         goals = np.asarray(goals, dtype=float)
+        if goals.ndim == 1:
+            goals = goals[:, None, None] * [0.0, 0.0, 1.0]
         if goals.ndim != 3 or goals.shape[2] not in (2, 3):
-            raise InputError(f"goals must have shape (num_envs, jumps, 2 or 3), got {goals.shape}")
+            raise InputError(f"goals must have shape (num_envs,) or (num_envs, jumps, 2 or 3), got {goals.shape}")
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
         self.headings, self.delay, self.rest = headings, delay, rest
+        self.to_heights = bool((self.goals[..., 2] > 0.0).all())  # whether all goals are apex heights
+        places = ("goal_x_m", "goal_y_m", "distance_at_rest_m", "apex_m")
+        heights = ("goal_height_m", "apex_m", "apex_error_m")
+        self.main_columns = (*(heights if self.to_heights else places), "tilt_deg", "outcome")
+        self.spacing = 1.2 if self.to_heights else 3.0
         self.count, *_ = shape = goals.shape[:2]
         # (num_envs,) index of the current jump; the number of jumps in a row after the last
         self.current = np.zeros(self.count, dtype=int)
@@ -222,7 +230,17 @@ class JumpLog(EvaluationLog):
         self._air_time, self._paw_air_time = np.zeros(self.count), np.zeros((self.count, 4))
         self._paw_start = np.full((self.count, 4, 2), np.nan)  # [m] last contacts before takeoff
         self._paw_touched, self._rising_flight = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
-        self._success = success_index(terminations)
+        if SUCCESS not in terminations:
+            names = ", ".join(terminations)
+            raise InputError(f"the evaluation needs a termination {SUCCESS!r}, the task has {names}")
+        self._success = terminations.index(SUCCESS)
+
+    @property
+    def seconds(self) -> float:
+        """Maximum simulated time [s]: each jump to a place waits, squats and flies for at most 3.5 s."""
+        if self.to_heights:
+            return 7.0 + self.rest
+        return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
 
     def begin(self, env: Env) -> None:
         """Reset every world to the default pose, and command its first jump `delay` seconds after the reset."""
@@ -302,9 +320,14 @@ class JumpLog(EvaluationLog):
         self.lift_time[at] = np.maximum(self.lift_time[at], self._paw_air_time[row].max(axis=1))
 
     @property
+    def landing(self) -> np.ndarray:
+        """Base position at the end of each jump [m], in the frame of the goal's x and y, (..., 2)."""
+        return self.goals[..., :2] + turn_plane(self.end_position - self.goal_world, -self.heading)
+
+    @property
     def ends(self) -> np.ndarray:
         """End of each jump, (num_envs, jumps in a row): SUCCESS, another outcome, NO_END or NOT_BEGUN."""
-        return np.where(np.isnan(self.heading), NOT_BEGUN, outcome_names(self.terminations, NO_END)[self.end])
+        return np.where(np.isnan(self.heading), NOT_BEGUN, np.array([*self.terminations, NO_END])[self.end])
 
     @property
     def outcome(self) -> JumpOutcome:
@@ -326,24 +349,39 @@ class JumpLog(EvaluationLog):
         """Return goals, headings, the fields of `JumpOutcome` and outcomes, one value per jump, world after world."""
         columns = {name: self.goals[..., i].ravel() for i, name in enumerate(("goal_x_m", "goal_y_m", "goal_height_m"))}
         columns |= {"heading_deg": np.degrees(self.heading).ravel(), **self.outcome.arrays()}
-        lists = {name: values.tolist() if values.dtype == bool else finite(values) for name, values in columns.items()}
-        return lists | {"outcome": self.outcomes.ravel().tolist()}
+        return listed(columns | {"outcome": self.outcomes.ravel()})
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current base height [m] of some worlds."""
-        heights = self.arrays["base_pos"][list(worlds), 2]
-        return {f"height/base, {name} [m]": height for name, height in zip(self.names(worlds), heights, strict=True)}
+    def all_commands(self) -> np.ndarray:
+        """Return the goals of all jumps [m], (num_envs, jumps in a row, 3)."""
+        return self.goals
 
-    def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the current phase of some worlds' jumps, an entry of PHASES."""
-        phases = self.arrays["phase"][list(worlds)]
-        return {f"phase/{name}": PHASES[phase] for name, phase in zip(self.names(worlds), phases, strict=True)}
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current base height, and commanded height or distance of the base from the current goal, [m]."""
+        series = {"height/base, {} [m]": self.arrays["base_pos"][:, 2]}
+        if self.to_heights:
+            return series | {"height/command, {} [m]": self.goals[:, 0, 2]}
+        offset = (self.arrays["base_pos"] - self.arrays["goal"])[:, :2]
+        return series | {"distance/to goal, {} [m]": np.linalg.norm(offset, axis=1)}
 
+    def states(self) -> dict[str, np.ndarray]:
+        """Return the current phases of all worlds' jumps, entries of PHASES."""
+        return {"phase/{}": np.array(PHASES)[self.arrays["phase"]]}
 
-def yaw_of(quat: np.ndarray) -> np.ndarray:
-    """Return the yaw [rad], (...), of quaternions (..., 4), xyzw: angle of body x in the world plane, from world x."""
-    x, y, z, w = np.moveaxis(quat, -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the commanded heights, or the goals in the world frame with z = 0."""
+        if self.to_heights:
+            return {"heights": self.goals[:, 0, 2]}
+        return {"goals": np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))}
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the goals [m] of some worlds: key `targets_m` for heights, `goals_m` for places."""
+        goals = self.goals[list(worlds)]
+        return {"targets_m": goals[:, 0, 2].tolist()} if self.to_heights else {"goals_m": goals[..., :2].tolist()}
+
+    def labels(self, worlds: Sequence[int]) -> list[str]:
+        """Return the first goals of some worlds in metres: "0.90 m" up or ahead, or "(0.80, 0.20) m" ahead and left."""
+        goals = self.goals[list(worlds), 0]
+        return [f"{x + height:.2f} m" if y == 0.0 else f"({x:.2f}, {y:.2f}) m" for x, y, height in goals]
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:

@@ -17,15 +17,10 @@ if TYPE_CHECKING:
 RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
 STAND = 31  # Policy steps in the default pose before the ramp, as many as before the command in a sweep
 COAST = 30  # Policy steps after the extension, within which the apex has passed
+LEVELS = np.repeat([0.0, np.nan, 1.0, -1.0, 0.0], [STAND, RAMP, HOLD, EXTEND, COAST])
+LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
+"""[1] Action of the transversal motors at every policy step of the open-loop jump: 1 squat, -1 extension."""
 PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
-
-
-def open_loop_action(step: int) -> float:
-    """Return the action [1] of the transversal motors at a policy step of the open-loop jump: 1 squat, -1 extension."""
-    ramp_step = step - STAND
-    if ramp_step >= RAMP + HOLD:
-        return -1.0 if ramp_step < RAMP + HOLD + EXTEND else 0.0
-    return min(max(ramp_step, 0) / RAMP, 1.0)
 
 
 def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
@@ -45,10 +40,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
         env.set(name, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
-    steps = STAND + RAMP + HOLD + EXTEND + COAST
-    with phase(f"simulating {env.num_envs} open-loop jumps", steps) as advance:
-        for step in range(steps):
-            level = open_loop_action(step)
+    with phase(f"simulating {env.num_envs} open-loop jumps", len(LEVELS)) as advance:
+        for step, level in enumerate(LEVELS.tolist()):
             env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
             arrays = env.task_arrays()
             diverged |= env.episodes.diverged.numpy() != 0

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
 from jumper_warp.utils.progress import phase
@@ -53,16 +51,20 @@ class EvaluationLog(ABC):
         """Return the values of all trials as columns by name: lists of equal length, each of one type or None."""
 
     @abstractmethod
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return current values to plot of some worlds (indices), by `group/quantity, name of the world [unit]`."""
+    def series(self) -> dict[str, np.ndarray]:
+        """Return current values to plot of all worlds, (num_envs,), by `group/quantity, {} [unit]`; {}: its name."""
 
-    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
-        """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
-        return None
+    def states(self) -> dict[str, np.ndarray]:
+        """Return current states of all worlds as text, (num_envs,), such as phases of jumps, by `quantity/{}`."""
+        return {}
 
-    def goal_heights(self, worlds: Sequence[int]) -> np.ndarray | None:
-        """Return commanded heights [m] of the base at the apex, above the ground, (worlds,), or None."""
-        return None
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return what recordings draw of all worlds, by name.
+
+        `goals` [m] (num_envs, goals per world, 3), world frame; `heights` [m] (num_envs,), commanded, of the base at
+        the apex; `commands` (num_envs, 3), current velocities ahead, left [m/s], about z [rad/s], body axes.
+        """
+        return {}
 
     def all_commands(self) -> np.ndarray | None:
         """Return the commands of all worlds, (..., 3), as in `evaluation.trained`; None if these have no range."""
@@ -73,20 +75,17 @@ class EvaluationLog(ABC):
         return [f"{self.row_name} {world + 1}" for world in worlds]
 
     def names(self, worlds: Sequence[int]) -> list[str]:
-        """Return distinct names of some worlds: their labels, with the world's index if a label is repeated."""
+        """Return distinct names of some worlds: their labels, with the world's number if a label is repeated."""
         labels = self.labels(worlds)
+        pairs = zip(labels, worlds, strict=True)
         return [
-            label if labels.count(label) == 1 else f"{label} ({world})"
-            for label, world in zip(labels, worlds, strict=True)
+            label if labels.count(label) == 1 else f"{label}, {self.row_name} {world + 1}" for label, world in pairs
         ]
 
-    def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return current states of some worlds as text, such as the phase of a jump, by `quantity/name`."""
-        return {}
-
-    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray | None:
-        """Return current commanded velocities ahead, left [m/s], about z [rad/s], body axes, (worlds, 3), or None."""
-        return None
+    def named(self, values: Mapping[str, Any], worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the values of some worlds, of `series` or `states`, by key with the world's name in place of {}."""
+        names = list(zip(self.names(worlds), worlds, strict=True))
+        return {key.format(name): values[key][world] for name, world in names for key in values}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the metadata, JSON values by key, that a recording of some worlds (indices) saves."""
@@ -129,22 +128,10 @@ def run_evaluation(
             advance()
 
 
-def success_index(terminations: Sequence[str]) -> int:
-    """Return the index of SUCCESS among termination names. Raises InputError: it is missing."""
-    if SUCCESS not in terminations:
-        raise InputError(f"the evaluation needs a termination {SUCCESS!r}, the task has {', '.join(terminations)}")
-    return list(terminations).index(SUCCESS)
-
-
-def with_terminations(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
-    """Return a copy of the task with only the named terminations, in this order; unknown names are ignored."""
-    terms = {term.name: term for term in task.terminations}
-    return replace(task, terminations=tuple(terms[name] for name in names if name in terms))
-
-
-def termination_names(task: TaskCfg) -> tuple[str, ...]:
-    """Return the names of a task's terminations, in the order in which they are checked."""
-    return tuple(term.name for term in task.terminations)
+def check(condition: bool, message: str) -> None:
+    """Raise InputError with the message unless the condition holds."""
+    if not condition:
+        raise InputError(message)
 
 
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
@@ -152,16 +139,15 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
 
 
-def outcome_names(terminations: Sequence[str], *more: str) -> np.ndarray:
-    """Return the names of outcomes by index of the termination that ended an episode; more: names to append."""
-    return np.array([*terminations, *more])
-
-
 def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:
     """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: noun for the trials."""
     return {f"{prefix}{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
 
 
-def finite(values: np.ndarray) -> list[float | None]:
-    """Convert values (n,) to a list of floats for JSON, with None for NaN and infinity."""
-    return [float(value) if np.isfinite(value) else None for value in values]
+def listed(columns: Mapping[str, np.ndarray]) -> dict[str, list]:
+    """Convert arrays (n,) by name to lists for JSON, with None for NaN and infinity."""
+    lists = {name: values.tolist() for name, values in columns.items()}
+    return {
+        name: [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]
+        for name, values in lists.items()
+    }

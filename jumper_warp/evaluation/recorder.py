@@ -60,10 +60,15 @@ class EnvRecorder:
         if self.block is not None:
             self.block_positions.append(block_positions(sim)[self.worlds])
         self.frames += 1
+        series = log.named(log.series(), self.worlds) | self._motor_series()
         self.recorder.record(
-            self.frames * self.env.step_dt, poses.reshape(-1, 7), log.series(self.worlds) | self._motor_series(),
-            ankles(poses), forces, states=log.states(self.worlds), commands=log.velocity_commands(self.worlds),
+            self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces,
+            states=log.named(log.states(), self.worlds), commands=self._marks().get("commands"),
         )  # fmt: skip
+
+    def _marks(self) -> dict[str, np.ndarray]:
+        """Return the log's `marks` of the recorded worlds."""
+        return {name: values[self.worlds] for name, values in self.log.marks().items()}
 
     def _motor_series(self) -> dict[str, float]:
         """Return values of the first recorded world's paws and motors, by name of the series.
@@ -81,8 +86,8 @@ class EnvRecorder:
         """Return a recording of all frames so far, with the goals of the log and the blocks."""
         from jumper_warp.viz.props import with_blocks
 
-        goals, heights = self.log.goal_markers(self.worlds), self.log.goal_heights(self.worlds)
-        recording = self.recorder.recording(goals=goals, heights=heights)
+        marks = self._marks()
+        recording = self.recorder.recording(goals=marks.get("goals"), heights=marks.get("heights"))
         if self.block is None:
             return recording
         half, height = self.block["half"][self.worlds], self.block["height"][self.worlds]
@@ -120,11 +125,6 @@ def peak_forces(sim: Simulation) -> np.ndarray:
     size = np.linalg.norm(force, axis=2, keepdims=True)
     direction = np.where(size > 0.0, force / np.where(size > 0.0, size, 1.0), [0.0, 0.0, 1.0])
     return direction * sim.physics.peak_paw_force.numpy().T[..., None]
-
-
-def largest_forces(forces: np.ndarray) -> np.ndarray:
-    """Return the largest force [N] on each paw in several physics steps, (4, 3); forces: (steps, 4, 3)."""
-    return forces[np.linalg.norm(forces, axis=2).argmax(axis=0), np.arange(forces.shape[1])]
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

@@ -11,20 +11,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.evaluations import EvaluationFlags, evaluation_of
+from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
-from jumper_warp.evaluation.trained import trained_range, trained_success
+from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.registry import of_project
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import range_words
@@ -99,6 +98,12 @@ class Run(ABC):
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
 
+    def prepare_from(self, name: str, args: EvaluationArgs) -> Self:
+        """Call `prepare` with the flags of an experiment, and return the run itself; name: of the output folder."""
+        self.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        self.print_flags = args
+        return self
+
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the policy as a function from observations (num_envs, num_obs) to actions, see `run_evaluation`."""
@@ -162,10 +167,13 @@ class Run(ABC):
     ) -> Log:  # fmt: skip
         """Run one episode per world with the commands of a log, and return the log.
 
-        film: name of the recording and picture of some worlds; empty: none. film_scene: the environment's `ground`
-        and `block` for the recording. on_step: called with the log after every policy step.
+        film: name of the recording and picture of `record` evenly spaced worlds; empty: none. film_scene: the
+        environment's `ground` and `block` for the recording. on_step: called with the log after every policy step.
         """
-        recorder = self._make_recorder(env, log, film_scene or {}) if film and self.record else None
+        recorder, scene = None, film_scene or {}
+        if film and self.record:
+            worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
+            recorder = EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
         def after_step() -> None:
             if on_step is not None:
@@ -181,11 +189,6 @@ class Run(ABC):
         if recorder is not None:
             save_recording(recorder.recording(), self.folder, film)
         return log
-
-    def _make_recorder(self, env: Env, log: EvaluationLog, scene: Mapping[str, Any]) -> EnvRecorder:
-        """Return a recorder of `record` evenly spaced worlds; scene: `film_scene` of `run_episodes`."""
-        worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
-        return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
     def write(self, metrics: AnyMetrics) -> dict[str, Any]:
         """Write conditions and metrics to `metrics.json`, and return all values by name."""
@@ -248,19 +251,7 @@ class EvaluationRun(Run):
                 f"expected a policy with evaluation suite {' or '.join(evaluations)}, "
                 f"{args.policy} (task {run.task.name}) has {run.task.evaluation_suite}"
             )
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
-        run.print_flags = args
-        return run
-
-    def evaluate(
-        self, flags: EvaluationFlags, conditions: Conditions, out: Path | None, *, save_trials: bool
-    ) -> dict[str, Any]:
-        """Run the trials that flags define, write and print their metrics, and return all values; see `prepare`."""
-        self.prepare("evaluate", conditions, out, save_trials=save_trials)
-        log = flags.log(self.evaluation.prepare_task(self.task), conditions.stream_seed)
-        self.run_episodes(self.env(log.count), log)
-        metrics = flags.metrics(log) | trained_success(self.task, log)
-        return self.report(metrics, self.evaluation.paper if of_project(self.task.name) else {})
+        return run.prepare_from(name, args)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the policy's function from observations to actions, `Policy.act`."""
@@ -291,17 +282,6 @@ class SkillRun(Run):
         """Load the policies; call `prepare` before any other method. Raises PolicyError or CheckpointError."""
         super().__init__()
         self.skills = SkillPolicies(names)
-
-    @classmethod
-    def from_args(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
-        """Return a prepared evaluation of the named policies with the flags of an experiment; name: of the folder.
-
-        Raises PolicyError, CheckpointError or InputError.
-        """
-        run = cls(names)
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
-        run.print_flags = args
-        return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return a function that returns the actions of all skills, (skills, num_envs, 12).

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jumper_warp.evaluation.log import check
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_json
 
@@ -62,8 +63,7 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
         raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
     steps = tuple(_step(i, item) for i, item in enumerate(content))
     total = sum(step.seconds for step in steps)
-    if not total <= MAX_SECONDS:
-        raise InputError(f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
+    check(total <= MAX_SECONDS, f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
     return steps
 
 
@@ -79,24 +79,13 @@ def _step(index: int, item: Any) -> ScriptStep:
         raise InputError(f"{where}: {kind} has no {sorted(map(str, unknown))[0]!r:.40}")
     value = item[kind]
     values = _numbers(f"{where}: {kind}", value if isinstance(value, list) else [value], KINDS[kind], LIMITS[kind])
-    if kind == "stand":
-        return ScriptStep("stand", seconds=_seconds(where, values[0]))
-    if kind == "walk":
-        return ScriptStep("walk", values, _seconds(where, item.get("seconds", 2.0)))
-    if kind == "jump_up" and not values[0] > 0.0:
-        raise InputError(f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
-    return ScriptStep(kind, values)
-
-
-def _seconds(where: str, value: Any) -> float:
-    """Check and return a duration [s] in a script: positive, at most MAX_SECONDS. Raises InputError.
-
-    where: prefix of messages.
-    """
-    (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
-    if not seconds > 0.0:
-        raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
-    return seconds
+    if kind.startswith("jump"):
+        check(kind != "jump_up" or values[0] > 0.0, f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
+        return ScriptStep(kind, values)
+    time = values[0] if kind == "stand" else item.get("seconds", 2.0)
+    (seconds,) = _numbers(f"{where}: seconds", [time], 1, MAX_SECONDS)
+    check(seconds > 0.0, f"{where}: seconds must be positive, got {seconds:g}")
+    return ScriptStep(kind, values if kind == "walk" else (0.0, 0.0, 0.0), seconds)
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
@@ -107,6 +96,5 @@ def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tupl
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )
-    if not good:
-        raise InputError(f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
+    check(good, f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
     return tuple(float(v) for v in values)

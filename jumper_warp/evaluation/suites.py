@@ -15,14 +15,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
-from jumper_warp.evaluation.landings import LandingLog
-from jumper_warp.evaluation.log import within
+from jumper_warp.evaluation.jumps import TOLERANCE, JumpLog, JumpOutcome
+from jumper_warp.evaluation.log import check, within
 from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
+from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
+from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
@@ -57,27 +57,6 @@ PUBLISHED = {
 """[m] Published jump distances of robots, from the paper's table."""
 
 
-class BasePaths:
-    """Recorder of the paths of all bases; call the object after every policy step."""
-
-    def __init__(self) -> None:
-        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
-
-    def __call__(self, landings: LandingLog) -> None:
-        """Append the current base positions; NaN for worlds whose last jump has ended."""
-        running = landings.current < landings.goals.shape[1]
-        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
-
-    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
-
-        headings [rad]: headings of the robots at the start, (worlds,).
-        """
-        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
-        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
 @dataclass(frozen=True)
 class Grid(Suite):
     """Jumps to goals on a grid 0.35 to 1.4 m ahead and up to 0.35 m to either side, two per goal.
@@ -107,11 +86,8 @@ class Grid(Suite):
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot the landing positions, and return the metrics."""
         landings = self.run_landings(run, self.goals, film="jumps")
-        plot_landings(
-            run.folder / "grid.png", {"": landed_at(landings)}, tolerance=TOLERANCE,
-            title="Jumps to a grid of goals", conditions=f"{run.title}, {len(landings.end)} jumps",
-        )  # fmt: skip
-        inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
+        plot(run, "grid", "Jumps to a grid of goals", {"": landings}, f"{len(landings.end)} jumps")
+        inside = landings.goals[..., 0] < AHEAD[1] - 1.0e-6
         outcome = landings.outcome
         return jump_metrics(outcome) | range_metrics(outcome, inside, "less than 1.4 m ahead")
 
@@ -125,7 +101,7 @@ class Ring(Suite):
 
     name: ClassVar = "ring"
     summary: ClassVar = ("success_rate", "goal_distance_at_rest_mean_m", *(f"{name}_success_rate" for name in SECTORS))
-    least: ClassVar = (len(SECTORS), 0.1)
+    least: ClassVar = len(SECTORS)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,10 +112,7 @@ class Ring(Suite):
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
-        plot_landings(
-            run.folder / "landings.png", {"": landed_at(landings)}, tolerance=TOLERANCE,
-            title=f"Jumps over {self.radius:g} m", conditions=f"{run.title}, {self.num_jumps} jumps",
-        )  # fmt: skip
+        plot(run, "landings", f"Jumps over {self.radius:g} m", {"": landings}, f"{self.num_jumps} jumps")
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         rows, values = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate"), jump_metrics(landings.outcome)
         for i, name in enumerate(SECTORS):
@@ -177,9 +150,12 @@ class Consecutive(Suite):
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
         logs, paths = [], []
         for name, goals in (("pairs", pairs), ("row", rows)):
-            base_paths, delay = BasePaths(), rng.uniform(*DELAYS, len(goals))
-            logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=base_paths))
-            paths.append(base_paths.in_start_frame(logs[-1].headings))
+            positions: list[np.ndarray] = []
+            logs.append(self.run_landings(
+                run, goals, delay=rng.uniform(*DELAYS, len(goals)), film=name,
+                on_step=lambda log, to=positions: to.append(running_positions(log)),
+            ))  # fmt: skip
+            paths.append(turn_plane(np.stack(positions, axis=1), -logs[-1].headings[:, None]))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
         plot_paths(run.folder / "paths.png", parts, PAIRS, words)
@@ -187,7 +163,13 @@ class Consecutive(Suite):
         return consecutive_metrics(*logs)
 
 
-def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
+def running_positions(jumps: JumpLog) -> np.ndarray:
+    """Return the current base positions x, y [m], (worlds, 2), world frame; NaN if a world's last jump has ended."""
+    running = jumps.current < jumps.goals.shape[1]
+    return np.where(running[:, None], jumps.arrays["base_pos"][:, :2], np.nan)
+
+
+def consecutive_metrics(pairs: JumpLog, row: JumpLog) -> Metrics:
     """Return the metrics of pairs of jumps, and of long sequences of jumps as `row_<key>`.
 
     pairs: the first half diagonal, the second half straight.
@@ -260,7 +242,7 @@ class Platform(Suite):
         rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
         run.settings["edge_m"], values = self.edge, {}
-        done: dict[str, LandingLog] = {}
+        done: dict[str, JumpLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
             env = run.env(self.num_jumps, **scene)
             done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=scene)
@@ -268,11 +250,8 @@ class Platform(Suite):
             if "block" in scene:
                 slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
                 values |= {"block_slide_mean_m": mean(slide, "jumps"), "block_slide_max_m": largest(slide, "jumps")}
-        plot_landings(
-            run.folder / "landings.png", {name: landed_at(landings) for name, landings in done.items()},
-            tolerance=TOLERANCE, outlines=self.outlines(goals), title="Jumps to other grounds",
-            conditions=f"{run.title}, {self.num_jumps} jumps each",
-        )  # fmt: skip
+        words, outlines = f"{self.num_jumps} jumps each", self.outlines(goals)
+        plot(run, "landings", "Jumps to other grounds", done, words, outlines=outlines)
         return values
 
 
@@ -333,9 +312,13 @@ class Farthest(Suite):
         return distance_metrics(bins)
 
 
-def landed_at(landings: LandingLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return goals [m], landing positions [m], (worlds, 2) each, and success (worlds,) of first jumps, for plots."""
-    return landings.goal_positions[:, 0], landings.landing[:, 0], landings.success[:, 0]
+def plot(run: EvaluationRun, file: str, title: str, logs: dict[str, JumpLog], words: str, **options: Any) -> None:
+    """Plot goals and landing positions of first jumps; logs: by scene; words: numbers; options: of `plot_landings`."""
+    points = {name: (log.goals[:, 0, :2], log.landing[:, 0], log.success[:, 0]) for name, log in logs.items()}
+    conditions = f"{run.title}, {words}"
+    plot_landings(
+        run.folder / f"{file}.png", points, tolerance=TOLERANCE, title=title, conditions=conditions, **options
+    )
 
 
 def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
@@ -343,7 +326,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
     return np.array([[(x0, y0), (x1, y0), (x1, y1), (x0, y1)]])
 
 
-def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
+def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     """Return reliable jump distances, the metrics of all jumps, and those of each bin as lists `bin_<key>`.
 
     bins: logs by distance at the bin's middle [m], ascending.
@@ -351,7 +334,7 @@ def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
     outcomes = [landings.outcome for landings in bins.values()]
     together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
                               for name in (field.name for field in fields(JumpOutcome))})  # fmt: skip
-    goals = np.concatenate([landings.goal_positions for landings in bins.values()])
+    goals = np.concatenate([landings.goals for landings in bins.values()])
     inside = within(goals[..., 0], IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]
     lists: dict[str, list[Any]] = {key: [metrics[key].value for metrics in by_bin] for key in MEANS}

@@ -10,17 +10,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation import heights, landings
-from jumper_warp.evaluation.heights import HeightFlags
-from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
-from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_terminations
-from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
+from jumper_warp.evaluation.jump_metrics import HEIGHT_PAPER, PLACE_METRICS, PLACE_PAPER, HeightFlags, LandingFlags
+from jumper_warp.evaluation.jumps import (
+    DELAY,
+    REST_TIME,
+    TOLERANCE,
+    JumpLog,
+    random_headings,
+    with_jump_terminations,
+    with_second_takeoff,
+)
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
-from jumper_warp.evaluation.log import termination_names, within
+from jumper_warp.evaluation.log import check, within
 from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.utils.errors import InputError
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
 
@@ -30,12 +34,6 @@ if TYPE_CHECKING:
 PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
 PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))
 PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training
-
-
-def check(condition: bool, message: str) -> None:
-    """Raise InputError with the message unless the condition holds."""
-    if not condition:
-        raise InputError(message)
 
 
 @dataclass(frozen=True)
@@ -49,13 +47,13 @@ class Suite(EvaluationArgs, ABC):
     evaluations: ClassVar[tuple[str, ...]] = PLACES  # Keys of `EVALUATIONS` of the policies that the suite accepts
     paper: ClassVar[dict[str, float]] = {}  # Values in the paper of metrics with the same names
     summary: ClassVar[tuple[str, ...]] = HEADLINES  # Keys of the metrics in the summary
-    least: ClassVar[tuple[int, float]] = (1, 0.1)  # Minimum number of jumps and minimum rest [s]
+    least: ClassVar[int] = 1  # Minimum number of jumps
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        jumps, rest = self.least
+        jumps = self.least
         check(self.num_jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.num_jumps}")
-        check(rest <= self.rest_time <= 10.0, f"rest_time must be in [{rest:g}, 10] s, got {self.rest_time}")
+        check(0.1 <= self.rest_time <= 10.0, f"rest_time must be in [0.1, 10] s, got {self.rest_time}")
 
     @abstractmethod
     def measure(self, run: EvaluationRun) -> Metrics:
@@ -75,41 +73,54 @@ class Suite(EvaluationArgs, ABC):
         run.settings["rest_s"] = self.rest_time
         return run, self.measure(run)
 
-    def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
-        """Run the jumps that flags of `jumper evaluate` define, and return their log; film: name of the recording."""
-        log = flags.log(env.task, self.stream_seed)
-        log.rest = self.rest_time
-        return run.run_episodes(env, log, film=film)
-
     def run_landings(
         self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
         delay: np.ndarray | float = DELAY, **options: Any,
-    ) -> LandingLog:  # fmt: skip
+    ) -> JumpLog:  # fmt: skip
         """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
-        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `LandingLog`; options:
+        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `JumpLog`; options:
         keywords of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(goals)) if env is None else env
         headings = random_headings(len(goals), self.stream_seed) if headings is None else headings
-        log = LandingLog(goals, termination_names(env.task), headings, delay, self.rest_time)
+        log = JumpLog(goals, env.task.termination_names, headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
-    def pushed_in_flight(self, run: EvaluationRun, metrics: Callable[[Conditions], Metrics], *names: str) -> Metrics:
-        """Repeat a test with pushes in flight; return the named metrics as `pushed_in_flight_<name>`.
 
-        Empty for nominal robots, and if the test itself pushes in flight. metrics: runs the test under conditions and
-        returns its metrics.
+class Sweep(Suite):
+    """Base class of the sweeps, over goals that flags of `jumper evaluate` define."""
+
+    pushed: ClassVar[tuple[str, ...]]  # Keys of the metrics that are also measured with pushes in flight
+
+    @property
+    @abstractmethod
+    def flags(self) -> HeightFlags | LandingFlags:
+        """Flags of `jumper evaluate` that define the jumps of this suite."""
+
+    def run_sweep(self, run: EvaluationRun, env: Env, film: str = "") -> JumpLog:
+        """Run one jump per goal, and return the log; film: name of the recording."""
+        log = self.flags.log(env.task, self.stream_seed)
+        log.rest = self.rest_time
+        return run.run_episodes(env, log, film=film)
+
+    def pushed_in_flight(self, run: EvaluationRun, change: Callable[[TaskCfg], TaskCfg]) -> Metrics:
+        """Repeat the test with pushes in flight; return the metrics `pushed` as `pushed_in_flight_<key>`.
+
+        Empty for nominal robots, and if the test itself pushes in flight. change: see `EvaluationRun.env`.
         """
         if not self.randomize or self.push_in_flight:
             return {}
-        values = metrics(replace(run.conditions, push_in_flight=True))
-        pushed = {name: values[name]._replace(over=f"{values[name].over} of robots pushed in flight") for name in names}
-        return {f"pushed_in_flight_{name}": value for name, value in pushed.items()}
+        env = run.env(self.num_jumps, change, replace(run.conditions, push_in_flight=True))
+        values = self.flags.metrics(self.run_sweep(run, env))
+        pushed = {
+            key: values[key]._replace(over=f"{values[key].over} of robots pushed in flight") for key in self.pushed
+        }
+        return {f"pushed_in_flight_{key}": value for key, value in pushed.items()}
 
 
 @dataclass(frozen=True)
-class HeightSweep(Suite):
+class HeightSweep(Sweep):
     """Sweep of jumps to evenly spaced heights from 0.5 to 1.2 m, one each.
 
     Every robot stands in the default pose and is commanded to jump after half a second. A jump reaches its height if
@@ -125,10 +136,12 @@ class HeightSweep(Suite):
 
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
-    paper: ClassVar = heights.PAPER
+    paper: ClassVar = HEIGHT_PAPER
     summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
                          "open_loop_apex_mean_m")  # fmt: skip
-    least: ClassVar = (3, 0.1)
+    pushed: ClassVar = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
+                        "miss_rate", "apex_error_abs_mean_m")  # fmt: skip
+    least: ClassVar = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,29 +155,23 @@ class HeightSweep(Suite):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps and the open-loop jumps of the same robots, plot both, and return the metrics."""
-        env, flags = run.env(self.num_jumps), self.flags
+        env = run.env(self.num_jumps)
         initial_state = env.state_dict()
-        jumps = self.run_flags(run, flags, env, "jumps")
+        jumps = self.run_sweep(run, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         plot_sweep(
-            run.folder / "sweep.png", jumps.commanded[:, 0], jumps.apex[:, 0], jumps.reached[:, 0], limit=limit,
+            run.folder / "sweep.png", jumps.goals[:, 0, 2], jumps.apex[:, 0], jumps.outcome.reached[:, 0], limit=limit,
             tolerance=TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
             labels=("commanded base height [m]", "highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
-
-        def pushed(conditions: Conditions) -> Metrics:
-            return flags.metrics(self.run_flags(run, flags, run.env(self.num_jumps, None, conditions)))
-
-        inside = within(jumps.commanded, flags.success_range)
-        values = flags.metrics(jumps) | limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside)
-        names = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
-                 "miss_rate", "apex_error_abs_mean_m")  # fmt: skip
-        return values | self.pushed_in_flight(run, pushed, *names)
+        inside = within(jumps.goals[..., 2], self.flags.success_range)
+        values = limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
+        return self.flags.metrics(jumps) | values | self.pushed_in_flight(run, with_jump_terminations)
 
 
 @dataclass(frozen=True)
-class DistanceSweep(Suite):
+class DistanceSweep(Sweep):
     """Sweep of jumps to evenly spaced goals 0.3 to 1.5 m straight ahead, one each.
 
     Every robot stands in the default pose, with a heading sampled from the full circle, and is commanded to jump after
@@ -181,9 +188,11 @@ class DistanceSweep(Suite):
     num_recorded: int = 5
 
     name: ClassVar = "sweep"
-    paper: ClassVar = landings.PAPER
+    paper: ClassVar = PLACE_PAPER
     summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
-    least: ClassVar = (3, 0.1)
+    pushed: ClassVar = ("success_rate", "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate",
+                        "landing_tilt_max_deg", "goal_distance_at_rest_mean_m")  # fmt: skip
+    least: ClassVar = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,31 +206,23 @@ class DistanceSweep(Suite):
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
-    def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
-        """Run one jump per distance in given conditions, return the log; film: name of the recording, or empty."""
-        change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
-        return self.run_flags(run, self.flags, run.env(self.num_jumps, change, conditions), film)
-
-    def metrics(self, log: LandingLog) -> Metrics:
+    def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of `jumper evaluate`, and the success rate over the paper's range of training."""
-        inside, note = within(log.goal_positions[..., 0], PAPER_TRAINED), "over 0.4 to 1 m"
-        success = chosen(PLACE_METRICS, "success_rate")
+        inside, success = within(log.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
+        note = "over 0.4 to 1 m"
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot reached over commanded distance, and return the metrics."""
         run.settings["end_at_second_takeoff"] = self.end_at_second_takeoff
-        landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)["trained_range_m"]
+        change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
+        landings = self.run_sweep(run, run.env(self.num_jumps, change), "jumps")
+        trained = trained_range(run.task)["trained_range_m"]
         plot_sweep(
-            run.folder / "sweep.png", landings.goal_positions[:, 0, 0], landings.landing[:, 0, 0],
+            run.folder / "sweep.png", landings.goals[:, 0, 0], landings.landing[:, 0, 0],
             landings.success[:, 0], tolerance=TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
             trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
             labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
-        pushed = self.pushed_in_flight(
-            run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "success_rate",
-            "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate", "landing_tilt_max_deg",
-            "goal_distance_at_rest_mean_m",
-        )  # fmt: skip
-        return self.metrics(landings) | pushed
+        return self.metrics(landings) | self.pushed_in_flight(run, change)

@@ -63,18 +63,20 @@ def trained_range(task: TaskCfg) -> dict[str, list[float]]:
     return {"trained_velocities": list(task.levels[-1].last_range)}
 
 
-def beyond_training(task: TaskCfg, commands: np.ndarray) -> list[str]:
-    """Return a text for each component of commands that is beyond its range in training, with its farthest value.
+def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
+    """Print one line on standard error if components of commands are beyond their ranges in training.
 
-    commands: (..., 3), x, y, z [m] or velocities [m/s], [m/s], [rad/s].
+    commands: (..., 3), x, y, z [m] or velocities [m/s], [m/s], [rad/s]; the line names the farthest value of each
+    component. None: no line.
     """
-    words, rows = [], np.reshape(commands, (-1, commands.shape[-1]))
-    for index, name, unit, low, high in trained_bounds(task):
+    words, rows = [], np.zeros((0, 3)) if commands is None else np.reshape(commands, (-1, commands.shape[-1]))
+    for index, name, unit, low, high in trained_bounds(task) if len(rows) else ():
         values = rows[:, index]
         excess = np.maximum(low - values, values - high)
-        if excess.max(initial=0.0) > TOLERANCE:
+        if excess.max() > TOLERANCE:
             words.append(f"{name} {values[excess.argmax()]:g} {unit} (trained {low:g} to {high:g})")
-    return words
+    if words:
+        print(f"jumper: beyond the training of {task.name}: {', '.join(words)}", file=sys.stderr)
 
 
 def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
@@ -94,12 +96,6 @@ def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
         "within_training_success_rate": rate(success[inside], f"jumps with goals of trained {ranges} m"),
         "beyond_training_success_rate": rate(success[~inside], "jumps beyond training"),
     }
-
-
-def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
-    """Print one line on standard error if commands are beyond the training; arguments: as in `beyond_training`."""
-    if commands is not None and (words := beyond_training(task, commands)):
-        print(f"jumper: beyond the training of {task.name}: {', '.join(words)}", file=sys.stderr)
 
 
 def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:

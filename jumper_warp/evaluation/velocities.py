@@ -10,12 +10,12 @@ import numpy as np
 import tyro
 from numpy.typing import ArrayLike
 
-from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.log import EvaluationLog, finite, outcome_names
+from jumper_warp.evaluation.jumps import wrapped
+from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
-from jumper_warp.utils.rotations import CONJUGATE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -41,8 +41,6 @@ class VelocityLog(EvaluationLog):
     times: np.ndarray = field(default_factory=lambda: np.zeros(1))  # [s] (commands,) Time of each command, first 0
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
     slew: np.ndarray | float = np.inf  # [m/s^2], [rad/s^2] (robots,) Rate at which commands change, from 0 at the start
-    kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
-    kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
     """Measured velocity in the components of `commands`, one array (robots, 3) per policy step."""
     end: np.ndarray = field(init=False)  # (robots,) Index of the termination of a fall, -1 if not fallen
@@ -85,7 +83,7 @@ class VelocityLog(EvaluationLog):
         return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return base state and termination of the robots for `update`, and set due commands and kicks.
+        """Return base state and termination of the robots for `update`, and set due commands.
 
         Keys: base_pos, base_quat (xyzw), base_vel, base_ang_vel (world axes), termination.
         """
@@ -98,12 +96,6 @@ class VelocityLog(EvaluationLog):
         if (changed := (command != self._command).any(axis=1)).any():
             env.command(command, changed)
         self._command = command
-        if self.kick is not None and self.kick_time is not None:
-            kicked = np.round(self.kick_time / env.step_dt).astype(int) == step
-            if kicked.any():
-                rates = qd.copy()
-                rates[kicked, :2] += self.kick[kicked]
-                sim.state.joint_qd.assign(rates.ravel())
         return arrays
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -126,7 +118,7 @@ class VelocityLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """Outcome of each robot, (robots,): name of the termination by which it fell, `walked` if it did not fall."""
-        return outcome_names([term.name for term in self.task.terminations], "walked")[self.end]
+        return np.array([*self.task.termination_names, "walked"])[self.end]
 
     def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3); NaN after a fall."""
@@ -146,11 +138,11 @@ class VelocityLog(EvaluationLog):
 
     def columns(self) -> dict[str, list]:
         """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over the walk, end."""
-        total, count = np.moveaxis(self.square_errors(settled=False), -1, 0)
+        total, count = np.moveaxis(square_sums(self.errors()), -1, 0)
         error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
-        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
+        return listed(columns | {"end": self.outcomes})
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
@@ -159,13 +151,6 @@ class VelocityLog(EvaluationLog):
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
                 "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
-
-    def square_errors(self, *, settled: bool) -> np.ndarray:
-        """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2).
-
-        settled: see `errors`.
-        """
-        return square_sums(self.errors(settled=settled))
 
     def errors(self, *, settled: bool = False) -> np.ndarray:
         """Return the tracking errors, velocity minus command, (steps, robots, 3); NaN after a fall.
@@ -181,10 +166,9 @@ class VelocityLog(EvaluationLog):
             error[(since > 0) & (since <= round(SETTLING_TIME / self.step_dt))] = np.nan
         return error
 
-    def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the current velocities and commands of some robots."""
-        rows = list(worlds)
-        return velocity_series(self.velocity[-1][rows], self.command_history()[-1][rows], self.names(worlds))
+    def series(self) -> dict[str, np.ndarray]:
+        """Return the current velocities and commands of all robots."""
+        return velocity_series(self.velocity[-1], self.command_history()[-1])
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
@@ -194,9 +178,9 @@ class VelocityLog(EvaluationLog):
         """Return all commanded velocities, (robots, commands, 3)."""
         return self.commands
 
-    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the current commands of some robots, (worlds, 3)."""
-        return self.command_history()[-1][list(worlds)]
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the current commands of all robots."""
+        return {"commands": self.command_history()[-1]}
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -210,13 +194,11 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
-def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[str]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of named robots in the form of `EvaluationLog.series`."""
+def velocity_series(velocity: np.ndarray, command: np.ndarray) -> dict[str, np.ndarray]:
+    """Return velocities and commands of all robots, (robots, 3) each, in the form of `EvaluationLog.series`."""
     series = {}
-    for robot, name in enumerate(names):
-        for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
-            series[f"{axis}/actual, {name} [{unit}]"] = float(velocity[robot, i])
-            series[f"{axis}/command, {name} [{unit}]"] = float(command[robot, i])
+    for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
+        series |= {f"{axis}/actual, {{}} [{unit}]": velocity[:, i], f"{axis}/command, {{}} [{unit}]": command[:, i]}
     return series
 
 
@@ -228,21 +210,19 @@ def square_sums(error: np.ndarray) -> np.ndarray:
     return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
-def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
-    """Return the definitions of the RMS tracking errors of each axis as metrics of a `VelocityLog`.
-
-    Keys: `<prefix>rmse_<axis>_<unit>`; over: name of a set of its robots, in `VelocityLog.trials`.
-    """
-    keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
-    return [
-        Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)
-    ]
-
-
+RMSE_ROWS = (
+    ("", "robots with commands at once", False), ("settled_", "robots with commands at once", True),
+    ("slewed_", "robots with slewed commands", False),
+)  # fmt: skip
+"""Prefix, trials and argument `settled` of `VelocityLog.errors`, of each set of tracking errors."""
 VELOCITY_METRICS = (
-    *rmse_rows("", "robots with commands at once", settled=False),
-    *rmse_rows("settled_", "robots with commands at once", settled=True),
-    *rmse_rows("slewed_", "robots with slewed commands", settled=False),
+    *(
+        Metric(
+            f"{prefix}rmse_{axis}_{unit}", rmse, over, lambda o, i=i, s=settled: square_sums(o.errors(settled=s))[:, i]
+        )
+        for prefix, over, settled in RMSE_ROWS
+        for i, (axis, unit) in enumerate(zip(AXES, UNITS, strict=True))
+    ),
     Metric("standing_drift_mean_m", mean, "robots that stood to the end", lambda o: o.distance),
     Metric("standing_turn_abs_mean_deg", mean, "robots that stood to the end", lambda o: abs(np.degrees(o.yaw))),
     Metric("fall_rate", rate, "robots", lambda o: o.fallen),
@@ -327,9 +307,6 @@ class VelocityPlayFlags:
 
 def check_velocity_settings(robots: int, seconds: float, *commands: float) -> None:
     """Raise InputError unless number of robots, time [s] and commanded velocities are within their limits."""
-    if not 1 <= robots <= MAX_ROBOTS:
-        raise InputError(f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
-    if not 0.0 < seconds <= 600.0:
-        raise InputError(f"seconds must be in (0, 600], got {seconds}")
-    if not all(abs(value) <= 10.0 for value in commands):
-        raise InputError(f"commands must be within 10 m/s or rad/s, got {commands}")
+    check(1 <= robots <= MAX_ROBOTS, f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
+    check(0.0 < seconds <= 600.0, f"seconds must be in (0, 600], got {seconds}")
+    check(all(abs(value) <= 10.0 for value in commands), f"commands must be within 10 m/s or rad/s, got {commands}")

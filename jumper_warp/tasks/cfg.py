@@ -259,6 +259,11 @@ class TaskCfg(Copyable):
         make = getattr(self.reset.settings, "heightfield", None)
         return None if make is None else make()
 
+    @property
+    def termination_names(self) -> tuple[str, ...]:
+        """Names of the terminations, in the order in which they are checked."""
+        return tuple(term.name for term in self.terminations)
+
     def on_level_ground(self) -> TaskCfg:
         """Return the task whose resets sample no ground and whose terrain is a plane."""
         if not hasattr(self.reset.settings, "on_level_ground"):

@@ -1,4 +1,4 @@
-"""Rotations in NumPy: unit quaternions xyzw and rotation vectors (axis times angle [rad])."""
+"""Rotations in NumPy: unit quaternions xyzw, rotation vectors (axis times angle [rad]), and angles about z."""
 
 from __future__ import annotations
 
@@ -33,3 +33,15 @@ def to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, quaternion[..., 3:])
     return quaternion[..., :3] * np.where(sine > 1.0e-12, angle / np.maximum(sine, 1.0e-12), 2.0)
+
+
+def yaw_of(quaternion: np.ndarray) -> np.ndarray:
+    """Return the yaw [rad], (...), of quaternions xyzw (..., 4): angle of body x in the world plane, from world x."""
+    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+def turn_plane(vector: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return vectors x, y (..., 2) turned by angles [rad], (...), about z."""
+    (x, y), cos, sin = np.moveaxis(vector, -1, 0), np.cos(angle), np.sin(angle)
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

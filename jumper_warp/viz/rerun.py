@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.utils.rotations import turn_plane, yaw_of
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR, LEG_COLORS
@@ -191,10 +192,7 @@ def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarra
     Commands are turned by the base's yaw; NaN is replaced by 0. Actual: central differences of the base's origin.
     """
     base = recording.body_poses(rank)[:, 0].astype(float)
-    x, y, z, w = base[:, 3:].T
-    yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-    ahead, left = recording.commands[:, rank, :2].T
-    commanded = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left], axis=1)
+    commanded = turn_plane(recording.commands[:, rank, :2], yaw_of(base[:, 3:]))
     moves = len(base) > 1
     actual = np.gradient(base[:, :2], recording.times, axis=0) if moves else np.zeros_like(base[:, :2])
     commanded, actual = (np.pad(np.nan_to_num(values), ((0, 0), (0, 1))) for values in (commanded, actual))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from jumper_warp.utils.rotations import turn_plane, yaw_of
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import FIELD_OF_VIEW, Line, View
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR
@@ -132,10 +133,7 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
     if not len(recording.commands) or not np.isfinite(recording.commands[frame, rank]).all():
         return []
     poses = recording.poses[:, recording.body_indices(rank)[0]].astype(float)
-    x, y, z, w = poses[frame, 3:]
-    yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-    ahead, left = recording.commands[frame, rank, :2]
-    commanded = np.array([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left, 0.0])
+    commanded = np.append(turn_plane(recording.commands[frame, rank, :2], yaw_of(poses[frame, 3:])), 0.0)
     window = np.abs(recording.times - recording.times[frame]) <= 0.5 * VELOCITY_WINDOW + 1.0e-9
     path, times = poses[window, :3], recording.times[window]
     actual = (path[-1] - path[0]) / max(times[-1] - times[0], 1.0e-9) * [1.0, 1.0, 0.0]

@@ -20,8 +20,7 @@ from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
-from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
-from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import load_policy, open_policy

@@ -6,9 +6,8 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
-from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.jumps import TERMINATIONS
-from jumper_warp.evaluation.landings import LandingFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
+from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
 from jumper_warp.evaluation.run import write_trials
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
@@ -48,11 +47,11 @@ def test_refuses_unknown_evaluation():
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
     flags = LandingFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.goal_positions[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    lateral = log.goal_positions[:, 0, 1]
+    assert log.goals[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    lateral = log.goals[:, 0, 1]
     assert -0.2 <= lateral.min() < lateral.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(TASK, seed=3).goal_positions, log.goal_positions)
+    assert np.array_equal(flags.log(TASK, seed=3).goals, log.goals)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
@@ -108,7 +107,7 @@ def test_success_range_selects_goals_by_distance():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]  # [m] at distances 0.3, 0.3 and 0.85
     flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
     landings = flags.log(TASK, seed=0)  # arrays: (3 worlds, 1 jump in a row)
-    landings.goal_positions[:, 0] = goals
+    landings.goals[:, 0, :2] = goals
     landings.end_position[:, 0], landings.goal_world[:, 0], landings.rest_position[:, 0] = goals, goals, goals
     landings.rest_speed[:] = 0.0
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
@@ -121,11 +120,11 @@ def test_success_range_selects_goals_by_distance():
 
 def test_height_goals_are_evenly_spaced():
     log = HeightFlags(num_jumps=3, height_range=(0.6, 1.0)).log(TASK, 0)
-    assert log.commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
+    assert log.goals[:, 0, 2] == pytest.approx([0.6, 0.8, 1.0])
 
 
 def test_every_rate_follows_from_saved_trials(tmp_path):
-    jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged", "low_base"))
+    jumps = JumpLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged", "low_base"))
     jumps.end[:, 0], jumps.apex[:, 0], jumps.heading[:] = [0, 1, 2], [0.52, np.nan, 1.05], 0.0
     jumps.rest_speed[0], jumps.touchdown[[0, 2]] = 0.0, 0.0
     write_trials(tmp_path, jumps, 1)

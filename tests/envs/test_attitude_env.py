@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from columns import MOTOR_COORDS, MOTOR_DOFS, Z
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, axis_turns, turn_metrics
+from jumper_warp.evaluation.attitude import TURN_METRICS, AttitudeLog, axis_metrics, axis_turns
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
@@ -19,6 +19,7 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import measure
 from support.momentum import momentum, rotational_inertia
 
 N = 64
@@ -146,7 +147,7 @@ def test_turn_metrics_have_error_settling_time_and_success(env):
     np.testing.assert_allclose(axis, 90.0 * np.repeat(np.eye(3), 2, axis=0) * np.tile([[1], [-1]], (3, 1)), atol=1e-9)
 
     def success():  # share of turns that settled without collision
-        return turn_metrics(turns)["settled_without_collision_rate"].value
+        return measure(TURN_METRICS, turns)["settled_without_collision_rate"].value
 
     assert success() == 0.0 and axis_metrics(turns)["roll_plus_settling_time_mean_s"].value is None
     turns.errors = [np.full(N, e) * DEG for e in (40.0, 3.0, 8.0, 4.0, 2.0)]

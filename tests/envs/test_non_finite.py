@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from jump_helpers import edit_coordinates, edit_episodes, make_env, only
-from jumper_warp.evaluation.dumps import DumpCfg, play_dump
+from jumper_warp.evaluation.commands import DumpCfg, play_dump
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm

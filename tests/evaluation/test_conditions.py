@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation import landings
-from jumper_warp.evaluation.jumps import with_jump_terminations
+from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations, with_second_takeoff
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_text, latency_values
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
@@ -36,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
     ("name", "change"),
     [
         ("horizontal-jump", with_jump_terminations),
-        ("horizontal-jump", landings.with_second_takeoff),
+        ("horizontal-jump", with_second_takeoff),
         ("vertical-jump", with_jump_terminations),
     ],
 )
@@ -51,7 +50,7 @@ def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
 
 def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
     names = {}
-    for change in (with_jump_terminations, landings.with_second_takeoff):
+    for change in (with_jump_terminations, with_second_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
@@ -187,7 +186,7 @@ def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, num_recorded=0, out=tmp_path, device="cpu")
     run = EvaluationRun.from_args("test", args)
     env = run.env(2)
-    log = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    log = JumpLog(np.array([[[0.5, 0.0]]] * 2), env.task.termination_names)
     run.run_episodes(env, log)
     values = run.report({}, {})
     assert (values["latency_requested_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")

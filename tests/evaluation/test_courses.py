@@ -170,7 +170,7 @@ def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
         course.record_step(env)
     before = course.switch_step[0, 1] - 1
     expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
-    np.testing.assert_allclose(course.goal_markers([0])[0], expected)
+    np.testing.assert_allclose(course.marks()["goals"][0], expected)
 
 
 def test_refuses_scripts_of_different_lengths():
@@ -180,8 +180,11 @@ def test_refuses_scripts_of_different_lengths():
 
 def test_series_and_columns_report_robot_state():
     course, _ = run_course()
-    series = course.series([1])
+    series = course.named(course.series(), [1])
     assert series["vx/actual, robot 1 [m/s]"] == pytest.approx(0.4)
-    assert series["vx/command, robot 1 [m/s]"] == pytest.approx(0.3) == course.velocity_commands([1])[0, 0]
-    assert course.states([1]) == {"skill/robot 1": "walk"} and course.columns()["commands_done"] == [3, 3]
+    assert series["vx/command, robot 1 [m/s]"] == pytest.approx(0.3) == course.marks()["commands"][1, 0]
+    assert course.named(course.states(), [1]) == {"skill/robot 1": "walk"} and course.columns()["commands_done"] == [
+        3,
+        3,
+    ]
     assert SimpleNamespace(**course.notes([0])).scripts[0][1] == ["jump_up", 0.75]

@@ -78,7 +78,7 @@ def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     assert columns["end"] == ["success", "low_base", "no_end", "diverged"]
     name = "episode 2, command 0.5 0.1 0"
     series = {f"height/base, {name} [m]": 0.0, f"distance/from start, {name} [m]": pytest.approx(0.4)}
-    assert episodes.series([1]) == series
+    assert episodes.named(episodes.series(), [1]) == series
 
 
 def test_update_returns_true_when_all_episodes_ended():  # 3: index of any termination

@@ -9,9 +9,8 @@ import torch
 from jumper_warp.cli.main import main
 from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
-from jumper_warp.evaluation.heights import HeightLog
 from jumper_warp.evaluation.jump_errors import jump_errors
-from jumper_warp.evaluation.log import termination_names
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
@@ -46,7 +45,7 @@ def test_jump_errors_match_environment_with_and_without_derivatives():
     errors, plain = jump_errors(group, network, derivatives=True), jump_errors(group, network, derivatives=False)
     assert torch.equal(errors.value, plain.value)
     assert errors.jacobian.shape == (4, len(network.weights)) and errors.valid.all()
-    jumps = HeightLog(np.linspace(0.8, 1.05, 4), termination_names(group.env.task))
+    jumps = JumpLog(np.linspace(0.8, 1.05, 4), group.env.task.termination_names)
     group.begin()
     for _ in range(120):  # 2 s, until after the apex
         group.env.step(policy.act(group.env.obs))
@@ -60,7 +59,7 @@ def test_errors_of_bases_that_rise_twice_are_those_of_the_evaluation():
     policy, count = open_policy("vertical_jump"), 64
     _, group = make_groups(policy, FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=count, device="cpu"))
     errors = jump_errors(group, Network(policy), derivatives=False)
-    jumps = HeightLog(group.commands[:, 2], termination_names(group.env.task))
+    jumps = JumpLog(group.commands[:, 2], group.env.task.termination_names)
     group.begin()
     for _ in range(180):  # 3 s, until after the landing
         group.env.step(policy.act(group.env.obs))

@@ -3,7 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.heights import HeightFlags, HeightLog
+from jumper_warp.evaluation.jump_metrics import HeightFlags
+from jumper_warp.evaluation.jumps import JumpLog
 from metric_helpers import values
 
 
@@ -36,7 +37,7 @@ def metrics_of(jumps):
 
 
 def test_height_metrics_match_hand_computed_values():
-    jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "diverged", "collided"))
+    jumps = JumpLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "diverged", "collided"))
     landed = {"phase": [2, 0, 2, 1], "phase_steps": [60, 0, 60, 0]}
     for heights in ([0.45, 0.5, 0.9, 0.4], [0.52, 1.0e13, 1.06, 0.9], [0.51, 0.4, 0.8, 0.8]):
         fly(jumps, heights)
@@ -89,7 +90,7 @@ def test_height_metrics_match_hand_computed_values():
 
 
 def test_unfinished_jump_fails_with_no_end_and_without_landing_metrics():
-    jumps = HeightLog(np.array([0.5]), ("success",))
+    jumps = JumpLog(np.array([0.5]), ("success",))
     assert not jumps.update(make_arrays(jumps), 1.0 / 60.0)
     metrics = metrics_of(jumps)
     assert metrics["success_rate"] == 0.0 and jumps.outcomes[0, 0] == "no_end"
@@ -97,7 +98,7 @@ def test_unfinished_jump_fails_with_no_end_and_without_landing_metrics():
 
 
 def test_columns_have_one_row_per_jump_and_none_for_nan():
-    jumps = HeightLog(np.array([0.5, 0.8]), ("success", "diverged"))
+    jumps = JumpLog(np.array([0.5, 0.8]), ("success", "diverged"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
     fly(jumps, [0.52, np.nan])
     jumps.update(make_arrays(jumps, termination=[0, 1], **landed), 1.0 / 60.0)
@@ -107,14 +108,14 @@ def test_columns_have_one_row_per_jump_and_none_for_nan():
 
 
 def test_jump_that_takes_off_before_command_can_be_seen_is_early():
-    jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged"))
+    jumps = JumpLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged"))
     for step, took_off in ((29, [0, 1, 0]), (30, [0, 0, 1]), (31, [1, 0, 0])):
         jumps.update(make_arrays(jumps, steps=[step] * 3, took_off=took_off), 1.0 / 60.0)
     assert jumps.early[:, 0].tolist() == [False, True, True]
 
 
 def test_landing_from_wrong_height_counts_as_miss_not_fall():
-    jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("low_base", "success"))
+    jumps = JumpLog(np.array([0.5, 0.6, 0.7]), ("low_base", "success"))
     fly(jumps, [0.7, 0.6, 0.65])
     changes = {"termination": [-1, 0, -1], "phase": [2, 2, 2], "phase_steps": [60, 3, 60]}
     jumps.update(make_arrays(jumps, **changes), 1.0 / 60.0)

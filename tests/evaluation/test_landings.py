@@ -6,10 +6,10 @@ import pytest
 import warp as wp
 
 from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import with_jump_terminations, wrapped, yaw_of
-from jumper_warp.evaluation.landings import LandingLog, with_second_takeoff
+from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations, with_second_takeoff, wrapped
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.registry import make_task
+from jumper_warp.utils.rotations import yaw_of
 from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step
@@ -72,7 +72,7 @@ class StubEnv:
 def five_jumps():
     """Return the log of five jumps headed 90° left: success, miss, divergence, collision, no jump."""
     goals = np.array([[[1.0, 0.0]], [[0.6, 0.2]], [[0.8, 0.0]], [[1.2, 0.0]], [[0.5, 0.0]]])
-    landings = LandingLog(goals, TERMINATIONS, QUARTER)
+    landings = JumpLog(goals, TERMINATIONS, QUARTER)
     env = StubEnv(5)
     landings.begin(env)
     # headed to the left, the goals lie at (-y, x)
@@ -145,7 +145,7 @@ def test_landing_metrics_match_hand_computed_values():
 
 
 def test_distances_flown_and_from_paw_to_paw_are_horizontal():
-    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     paws = np.zeros((4, 1, 3))
     for changes, shift, down in (
@@ -174,7 +174,7 @@ def test_log_does_not_change_after_all_jumps_ended():
 
 
 def test_jump_before_command_is_not_a_success():
-    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     env.set(took_off=1, steps=29)
     assert not landings.record_step(env)
@@ -187,7 +187,7 @@ def test_jump_before_command_is_not_a_success():
 
 @pytest.mark.parametrize(("steps", "hopped"), [([3, 3], False), ([1, 4], True)])
 def test_airtime_above_hop_time_after_touchdown_is_second_hop(steps, hopped):  # policy steps of 1/60 s, limit 3
-    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     for phase, force, count in ((1, 0.0, 20), (2, 0.0, steps[0]), (2, 9.0, 2), (2, 0.05, steps[1])):
         env.set(phase=phase)
@@ -212,7 +212,7 @@ def test_airtime_above_hop_time_after_touchdown_is_second_hop(steps, hopped):  #
     ],
 )
 def test_paw_lifted_3_policy_steps_after_its_contact_is_a_step(contacts, stepped):  # rows: paws down, policy steps
-    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     for phase, rows in ((0, [((0, 1, 2, 3), 5)]), (1, [((), 20)]), (2, contacts)):
         env.set(phase=phase)
@@ -238,7 +238,7 @@ def test_paw_lifted_3_policy_steps_after_its_contact_is_a_step(contacts, stepped
     ],
 )
 def test_second_takeoff_needs_upward_speed_and_no_contact(phases, takeoffs):
-    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     env.stand_on()
     env.set(phase=1, base_vel=[0.0, 0.0, 3.0])  # the takeoff of the jump itself does not count
@@ -261,7 +261,7 @@ def test_second_takeoff_needs_upward_speed_and_no_contact(phases, takeoffs):
 
 
 def test_longer_rest_time_counts_later_falls_but_not_later_speed():
-    landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), StubEnv(2)
+    landings, env = JumpLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), StubEnv(2)
     landings.begin(env)
     env.set(phase=2, phase_steps=60, termination=0)
     assert not landings.record_step(env)
@@ -276,7 +276,7 @@ def test_longer_rest_time_counts_later_falls_but_not_later_speed():
 
 
 def test_flight_of_next_jump_is_not_counted_as_step():
-    landings, env = LandingLog(np.zeros((1, 2, 2)), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.zeros((1, 2, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     env.set(phase=2, phase_steps=60)
     assert not landings.record_step(env) and len(env.commanded) == 1
@@ -290,7 +290,7 @@ def test_flight_of_next_jump_is_not_counted_as_step():
 
 
 def test_unfinished_jump_fails_at_last_position():
-    landings, env = LandingLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), StubEnv(1)
+    landings, env = JumpLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     assert not landings.record_step(env)
     metrics = values(jump_metrics(landings.outcome))
@@ -299,7 +299,7 @@ def test_unfinished_jump_fails_at_last_position():
 
 def two_in_a_row():
     """Return the log and environment of two rows of two jumps after the first: world 0 landed, world 1 collided."""
-    landings, env = LandingLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), StubEnv(2)
+    landings, env = JumpLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), StubEnv(2)
     landings.begin(env)
     env.set(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], termination=[-1, COLLIDED])
     assert not landings.record_step(env) and not env.commanded
@@ -323,7 +323,7 @@ def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]
     success = jump_metrics(landings.outcome)["success_rate"]
     assert (success.value, success.trials) == (pytest.approx(2 / 3), 3)
-    assert landings.goal_markers([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
+    assert landings.marks()["goals"][0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
 
 def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
@@ -332,15 +332,18 @@ def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
     assert all(len(values) == 4 for values in columns.values())
     assert columns["goal_x_m"] == [0.8, 0.7, 0.8, 0.7]
     assert columns["distance_at_end_m"][3] is None and columns["outcome"][3] == "not_begun"
-    assert landings.series([1])["distance/to goal, (0.80, 0.20) m [m]"] == pytest.approx(0.05)
+    assert landings.named(landings.series(), [1])["distance/to goal, (0.80, 0.20) m [m]"] == pytest.approx(0.05)
 
 
 def test_worlds_with_the_same_goal_have_distinct_names_in_series_and_states():
     landings, _ = two_in_a_row()
     assert landings.labels([0, 1]) == ["(0.80, 0.20) m"] * 2
-    assert landings.names([0, 1]) == ["(0.80, 0.20) m (0)", "(0.80, 0.20) m (1)"]
-    assert len(landings.series([0, 1])) == 2 * len(landings.series([0]))
-    assert list(landings.states([0, 1])) == ["phase/(0.80, 0.20) m (0)", "phase/(0.80, 0.20) m (1)"]
+    assert landings.names([0, 1]) == ["(0.80, 0.20) m, jump 1", "(0.80, 0.20) m, jump 2"]
+    assert len(landings.named(landings.series(), [0, 1])) == 2 * len(landings.series())
+    assert list(landings.named(landings.states(), [0, 1])) == [
+        "phase/(0.80, 0.20) m, jump 1",
+        "phase/(0.80, 0.20) m, jump 2",
+    ]
 
 
 def test_landing_evaluation_excludes_shaping_terminations():
@@ -360,17 +363,17 @@ def test_trained_range_covers_all_levels(task, range_m):
 
 def test_command_delay_may_differ_between_worlds():
     env = StubEnv(2)
-    LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
+    JumpLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
     assert env.command_step.tolist() == [30.0, 15.0]  # policy steps
 
 
 def test_maximum_time_grows_with_number_of_jumps():  # 1 + 2 * (3.5 + rest 1) + delay 0.5
-    assert LandingLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
+    assert JumpLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
 
 
 def test_refuses_goals_of_wrong_shape():
     with pytest.raises(ValueError, match="goals must have shape"):
-        LandingLog(np.zeros((3, 2)), TERMINATIONS)
+        JumpLog(np.zeros((3, 2)), TERMINATIONS)
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.5, 0.0, 2.0])

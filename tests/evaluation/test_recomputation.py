@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jumper_warp.evaluation.heights import HeightFlags
-from jumper_warp.evaluation.landings import LandingFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog
 from jumper_warp.policies.conditions import Conditions

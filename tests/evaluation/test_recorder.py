@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from jump_helpers import make_env, random_actions
-from jumper_warp.evaluation.heights import HeightLog
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, ankles
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import platform
@@ -41,7 +41,7 @@ def test_ankle_positions_follow_shank_poses():
 
 
 def test_paw_forces_are_peaks_between_the_frames():
-    env, log = make_env(1), HeightLog(np.array([0.9]), termination_names(make_task("vertical-jump")))
+    env, log = make_env(1), JumpLog(np.array([0.9]), make_task("vertical-jump").termination_names)
     recorder = EnvRecorder(env, log, [0])
     actions = iter(random_actions(1, 30))
     sampled_last = []

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.evaluation.courses import CourseLog
-from jumper_warp.evaluation.heights import HeightPlayFlags
-from jumper_warp.evaluation.landings import LandingPlayFlags
+from jumper_warp.evaluation.jump_metrics import HeightPlayFlags, LandingPlayFlags
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.evaluation.trained import trained_success, warn_beyond_training
 from jumper_warp.evaluation.velocities import VelocityPlayFlags

@@ -17,8 +17,8 @@ from experiments import (
     soak_test,
 )
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.heights import HeightFlags, HeightLog, run_jumps
-from jumper_warp.evaluation.jumps import with_jump_terminations
+from jumper_warp.evaluation.jump_metrics import HeightFlags
+from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
@@ -28,7 +28,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values
-from support.learning import LearningCurve
+from support.learning import LearningCurve, run_jumps
 from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
 
@@ -61,7 +61,7 @@ def test_new_reward_is_logged_by_name(trained):
 
 def height_log(target, apex, end, tilt_deg, rest_speed, early=False):
     """Return the log of finished jumps, one value each: heights [m], end (index in SWEEP_ENDS), rest_speed [m/s]."""
-    jumps = HeightLog(np.array(target), SWEEP_ENDS)
+    jumps = JumpLog(np.array(target), SWEEP_ENDS)
     jumps.apex[:, 0], jumps.end[:, 0], jumps.early[:, 0] = apex, end, early
     jumps.tilt[:, 0], jumps.rest_speed[:, 0] = np.radians(tilt_deg), rest_speed
     jumps.yaw[:], jumps.drift[:], jumps.heading[:] = 0.0, 0.0, 0.0
@@ -110,8 +110,8 @@ def test_sweep_metrics_match_hand_computed_values():
 
 def limits_of(jumps, limit):
     """Return the values of `limit_metrics` for a log and open-loop apexes [m], (num_envs,)."""
-    inside = within(jumps.commanded, (0.5, 1.1))
-    return values(limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside))
+    inside = within(jumps.goals[..., 2], (0.5, 1.1))
+    return values(limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside))
 
 
 def test_diverged_world_is_a_failure_excluded_from_errors():

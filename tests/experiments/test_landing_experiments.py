@@ -10,18 +10,17 @@ import torch
 
 from columns import X, Y
 from experiments import paper_tests
-from jumper_warp.evaluation.jumps import TERMINATIONS
-from jumper_warp.evaluation.landings import LandingLog
-from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
+from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
-    BasePaths,
     Consecutive,
     Farthest,
     Grid,
     Platform,
     consecutive_metrics,
     distance_metrics,
+    running_positions,
 )
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -30,6 +29,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import format_value
 from jumper_warp.utils.output import read_values
+from jumper_warp.utils.rotations import turn_plane
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values
 
@@ -51,7 +51,7 @@ def landing_log(goals, landing, end, **changes):
 
     goals, landing [m]: (worlds, jumps, 2), world; end: indices of terminations; changes: other arrays of the log.
     """
-    landings = LandingLog(np.array(goals, dtype=float), TERMINATIONS)
+    landings = JumpLog(np.array(goals, dtype=float), TERMINATIONS)
     landings.end[:] = end
     landings.goal_world[:], landings.end_position[:], landings.touchdown[:] = goals, landing, landing
     landings.takeoff[:], landings.rest_position[:], landings.rest_speed[:] = 0.0, landing, 0.0
@@ -126,17 +126,17 @@ def test_row_without_fall_may_miss_goals():
     assert (metrics["row_all_landed_rate"], metrics["row_all_success_rate"]) == (1.0, 0.5)
 
 
-def test_base_paths_are_in_start_frame():
-    base_paths = BasePaths()
-    landings = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS)
-    for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
-        landings.arrays = {"base_pos": np.array([place, place])}
-        base_paths(landings)
+def test_positions_of_bases_are_those_of_running_rows():
+    landings = JumpLog(np.zeros((2, 1, 2)), TERMINATIONS)
+    landings.arrays = {"base_pos": np.array([[0.0, 1.0, 0.3], [0.0, 1.0, 0.3]])}
     landings.current[1] = 1
-    base_paths(landings)
-    paths = base_paths.in_start_frame(np.array([0.5 * math.pi, 0.0]))
-    assert paths[0] == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]))
-    assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
+    positions = running_positions(landings)
+    assert positions[0] == pytest.approx([0.0, 1.0]) and np.isnan(positions[1]).all()
+
+
+def test_vectors_turn_about_z():
+    turned = turn_plane(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([-0.5 * math.pi, 0.5 * math.pi]))
+    assert turned == pytest.approx(np.array([[1.0, 0.0], [0.0, 1.0]]))
 
 
 def bin_log(middle, *, clean, stepped=0, hopped=0):
@@ -238,8 +238,8 @@ def hops():
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = LandingLog(
-        goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
+    landings = JumpLog(
+        goals, env.task.termination_names, headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
     script = HopPolicy()
 

@@ -47,9 +47,9 @@ def test_tests_are_the_papers(name, tests):
     logs = {test: make_log(task, test, 5) for test in names_of_tests(task)}
     assert {test: log.count for test, log in logs.items()} == tests
     if "straight" in logs:
-        assert logs["straight"].goal_positions[[0, -1], 0].tolist() == [[0.3, 0.0], [1.5, 0.0]]
+        assert logs["straight"].goals[[0, -1], 0, :2].tolist() == [[0.3, 0.0], [1.5, 0.0]]
     if "sweep" in logs:
-        assert logs["sweep"].commanded[[0, -1], 0].tolist() == [0.5, 1.2]
+        assert logs["sweep"].goals[[0, -1], 0, 2].tolist() == [0.5, 1.2]
 
 
 def test_the_first_seed_of_every_arm_is_first_and_walking_has_no_ablation():
