@@ -153,7 +153,7 @@ def option_of(arg: str) -> str:
 
 
 def switch_of(option: str) -> str:
-    """Return the flag of an option, as `--noise` of `--no-noise`; other options are returned unchanged."""
+    """Return the positive form of a command-line flag: `--noise` for `--no-noise`, any other flag unchanged."""
     return re.sub(r"(--|\.)no-([^.]+)$", r"\1\2", option)
 
 

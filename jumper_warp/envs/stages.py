@@ -104,7 +104,10 @@ class Stages:
         ]
 
     def after_load_state(self) -> None:
-        """Update start flag, parameters of terms, and solver after `load_state` wrote the arrays."""
+        """Update start flag, parameters of terms, and solver after `load_state` wrote the arrays.
+
+        Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
+        """
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()

@@ -143,7 +143,7 @@ class CourseLog(EvaluationLog):
         return arrays
 
     def record_step(self, env: Any) -> bool:
-        """Record a policy step, then send due commands and requests; return whether all courses have ended."""
+        """Record a policy step, then set due commands and policies of the robots; return whether all have finished."""
         before, previous = self.current.copy(), self._skill
         ended = super().record_step(env)
         rows, at, running = np.arange(len(before)), self._at, self.end < 0

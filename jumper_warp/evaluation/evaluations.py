@@ -26,7 +26,7 @@ from jumper_warp.utils.metrics import Metrics
 
 
 class EvaluationFlags(Protocol):
-    """Protocol of the flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
+    """Interface of a dataclass with the flags of `jumper evaluate` for one kind of task, such as jumps to heights."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
         """Return a new log with the commands of all worlds; seed: seed of sampled commands."""

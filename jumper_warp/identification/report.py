@@ -273,8 +273,9 @@ def progress_plot(result: Identification) -> Any:
 
 
 def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Plot one motion, measured and simulated, and its residuals; start: coordinates of its initial state, (I,).
+    """Plot one motion, measured and simulated, and its residuals, and return a Matplotlib figure.
 
+    start: fitted coordinates of the initial state, (I,), see `MotionResiduals`.
     Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     """
     figure = new_figure(10.0, 4.6)

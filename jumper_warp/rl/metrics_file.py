@@ -38,6 +38,8 @@ class MetricsFile:
         Raises OSError, e.g. on a full disk: the file is unchanged, and the line is written with the next one.
         """
         values = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        if self._pending:  # a write failed, and perhaps the removal of its partial line too
+            self._file.truncate(self._size)
         self._pending += json.dumps({"iteration": iteration, **values}, allow_nan=False).encode() + b"\n"
         written = 0
         try:

@@ -17,7 +17,7 @@ LOOPS_HEADER = """\
 
 
 def urdf(robot: RobotDescription) -> str:
-    """Return the robot's URDF as text, with its own masses, inertias and motor limits; comments are kept."""
+    """Return the robot's URDF as text, with the description's masses, inertias and motor limits; comments are kept."""
     root = fromstring(robot.urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
     for element in root.findall("link"):
         _write_inertial(_child(element, "inertial"), robot.link(element.get("name", "")))

@@ -98,9 +98,9 @@ class Physics(ABC):
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the solver's memory between steps: the arrays by name on which the next step depends.
+        """Return the arrays that a snapshot must save beside joint_q, joint_qd and `impulse`, by name; not copies.
 
-        Besides joint_q, joint_qd and `impulse`.
+        The next step depends on them, for example on a warm start of the solver. A solver without memory has none.
         """
         return {}
 

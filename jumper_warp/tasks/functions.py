@@ -77,7 +77,7 @@ def check_function(
 
 
 def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
-    """Raise InputError as `check_function` unless a function returns the type `returns`."""
+    """Check that a function returns the expected type; raise InputError with its file and line otherwise."""
     where = f"{where} {func.key.rsplit('.', 1)[-1]}"
     check_function(where, func, takes, shown_type(returns), lambda kind: SAME.get(kind, kind) is returns)
 

@@ -39,7 +39,8 @@ def test_mars_horizontal_policy_reaches_its_distances(tmp_path):
     args = {"policy": "mars_horizontal_jump", "num_jumps": 8, "distance_range": (0.5, 5.0)}  # [m]
     values = DistanceSweep(out=tmp_path, **args, **QUIET).run()
     assert values["success_rate"] == 1.0 and values["success_without_paw_lift_rate"] == 1.0
-    assert values["goal_distance_at_end_mean_m"] < 0.02 and values["gravity_m_s2"] == 3.71
+    assert values["goal_distance_at_end_mean_m"] < 0.02  # 0.0096 m of 4,096 jumps
+    assert values["gravity_m_s2"] == 3.71  # Mars
 
 
 def test_mars_policy_with_springs_reaches_its_distances(tmp_path):

@@ -182,8 +182,8 @@ class Bowl:
         self.goal = torch.tensor([0.6, 0.4], dtype=torch.float64)
         self.device = "cpu"
 
-    def rollout(self, _):
-        """Return what has `world_steps` and `reverse_steps`."""
+    def rollout(self, num_worlds):
+        """Return this stub, which counts steps as the `Rollout` of `num_worlds` worlds does."""
         return self
 
     def evaluate(self, x):

@@ -104,7 +104,7 @@ class FusedCollector:
         self.critic_obs.write(self._critic_obs, self.rollout.critic_features[-1])
 
     def act(self, step: int) -> None:
-        """Sample the actions for the environment's current state, and write features and samples of a step."""
+        """Sample actions for the current observations, and store observations and actions in the rollout."""
         rollout, fused, worlds = self.rollout, self._fused, self.env.num_envs
         self.obs.write(self.env.obs, rollout.features[step], step)
         self.critic_obs.write(self._critic_obs, rollout.critic_features[step], step)

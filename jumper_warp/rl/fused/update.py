@@ -54,7 +54,7 @@ class FusedUpdate:
 
     @torch.no_grad()
     def pack(self) -> None:
-        """Compute values, advantages and returns of the rollout, and update the running statistics."""
+        """Fill the batch with values, advantages and returns of the rollout, and update the value statistics."""
         rollout, model, cfg = self._collector.rollout, self._model, self._cfg
         (steps, worlds), actions = rollout.reward.shape, rollout.action.shape[2]
         for start in range(0, len(self._head), self._rows):
@@ -108,7 +108,7 @@ class FusedUpdate:
         update()
 
     def side_by_side(self, first: Callable[[], object], second: Callable[[], object]) -> None:
-        """Run two independent procedures, on a GPU in two streams, which are two branches of a captured graph."""
+        """Run two independent procedures, at the same time on a GPU and one after the other on a CPU."""
         if self._side_stream is None:
             first()
             second()

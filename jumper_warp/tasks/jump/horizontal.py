@@ -109,7 +109,7 @@ NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)  # First level of ev
 
 
 def horizontal_jump() -> TaskCfg:
-    """Return the horizontal jump with torque limits of 18 N m and, for lateral motors, the authors' 12 N m."""
+    """Return the task of a jump to a place ahead; torque limits are 18 N m, for lateral motors the paper's 12 N m."""
     return TaskCfg(
         name="horizontal-jump",
         state=JumpState,

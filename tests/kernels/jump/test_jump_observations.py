@@ -121,6 +121,7 @@ def test_noise_of_the_papers_task_is_gaussian_with_table_vi_as_standard_deviatio
     robots, n = Robots(task, 4096), 4096
     noise = robots.observe(noise=True) - robots.observe()
     assert not noise[:, :3].any() and not noise[:, 36:].any()  # commanded height, command, height; last actions
+    # Table VI of the paper: velocities [m/s, rad/s], gravity's direction [1], joint positions [rad], velocities [rad/s]
     sizes = np.concatenate([[0.1] * 6, [0.05] * 3, [3.0 * DEG] * 12, [10.0 * DEG] * 12])
     scaled = noise[:, 3:36] / sizes
     assert scaled.std(axis=0) == pytest.approx(1.0, abs=4.0 / math.sqrt(2.0 * n))

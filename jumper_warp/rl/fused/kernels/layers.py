@@ -170,7 +170,11 @@ def weight_gradient_tile(
     grad_out, x, index, partial, stride, rows, rows_per_split, tile, LAYERS: tl.constexpr, LAYER: tl.constexpr,
     BM: tl.constexpr, BN: tl.constexpr, BK: tl.constexpr,
 ):  # fmt: skip
-    """Write a tile of one layer in `weight_gradients`; its tiles are numbered along the rows of the weight first."""
+    """Write one tile of a layer's weight gradient and bias gradient; see `weight_gradients`.
+
+    tile: number within the layer, counted along the rows of the weight first. The bias gradient is a product with
+    ones, since only products sum over samples in tensor cores; 16 is their smallest width, and all columns are equal.
+    """
     num_in: tl.constexpr = LAYERS[LAYER][INPUTS]
     num_out: tl.constexpr = LAYERS[LAYER][OUTPUTS]
     repeat: tl.constexpr = LAYERS[LAYER][REPEAT]

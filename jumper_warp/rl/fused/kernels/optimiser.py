@@ -65,8 +65,11 @@ def adam_step(
 ):  # fmt: skip
     """Clip the gradient, update parameters and moments by a step of Adam, and add the statistics to `sums`.
 
-    gradient, squares, factors: of `prepare_step`, NUM_SQUARES blocks, a power of two BLOCKS at least. weights: the
-    copy of the parameters for products, in the places of `table` (3, size + 32). A non-finite gradient counts as 0.
+    gradient: (size + 32,), then surrogate, value loss, entropy, asymmetry, and the KL divergence as the last entry.
+    squares (NUM_SQUARES, 2), factors (2,): of `prepare_step`; BLOCKS: power of two, at least NUM_SQUARES. weights: the
+    copy of the parameters for products; table: (3, size + 32) of `FusedLayout`, the entry of each parameter in
+    `weights`, that of its mirror image, and its sign. sums: (9,) losses, KL, norms of actor and critic, skipped steps,
+    steps. A non-finite gradient counts as 0.
     """
     block = tl.arange(0, BLOCKS)
     actor = tl.sqrt(tl.sum(tl.load(squares + 2 * block, mask=block < NUM_SQUARES, other=0.0), 0))
