@@ -82,8 +82,8 @@ class MirroredVecEnv(Protocol):
 class DifferentiableVecEnv(VecEnv, Protocol):
     """Environment for SHAC: observations and rewards are differentiable with respect to earlier actions of a window.
 
-    Values are those of `obs`, `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in
-    every call.
+    A window is a call of `begin_window`, then `observe` and `step_with_gradient` in turn. Values are those of `obs`,
+    `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in every call.
     """
 
     def begin_window(self) -> None:
@@ -98,7 +98,7 @@ class DifferentiableVecEnv(VecEnv, Protocol):
         ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance one policy step; return the reward (num_envs,), differentiable where its terms are."""
+        """Advance as `step`, resets included; return the reward (num_envs,), differentiable where its terms are."""
         ...
 
 

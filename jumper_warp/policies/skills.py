@@ -30,7 +30,11 @@ class SkillNames:
 
 
 class SkillPolicies:
-    """Policies of the three skills, in the order WALK, JUMP_UP, JUMP_TO, with the environment that they act in."""
+    """Policies of the three skills, in the order WALK, JUMP_UP, JUMP_TO; `env` makes the environment that they act in.
+
+    sources, policies, tasks: name, policy and task of each; skills, handovers: tasks in the conditions of the last
+    `env`, and the conditions for a change of the skill.
+    """
 
     def __init__(self, names: SkillNames | None = None) -> None:
         """Load the policies (default names: `SkillNames()`).
@@ -64,7 +68,7 @@ class SkillPolicies:
     def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
         """Return an environment of `count` robots that start with WALK, and move the policies to its device.
 
-        The robot has the overlay of the policies' training. scene: further arguments of `Env`.
+        The robot has the overlay (changed parameters) of the policies' training. scene: further arguments of `Env`.
         Raises PolicyError: policies were trained with different overlays.
         """
         from jumper_warp.envs.env import Env

@@ -181,7 +181,7 @@ def test_refuses_scripts_of_different_lengths():
 def test_series_and_columns_report_robot_state():
     course, _ = run_course()
     series = course.named(course.series(), [1])
-    assert series["vx/actual, robot 2 [m/s]"] == pytest.approx(0.4)
+    assert series["vx/actual, robot 2 [m/s]"] == pytest.approx(0.4)  # command and error of `ScriptedEnv`
     assert series["vx/command, robot 2 [m/s]"] == pytest.approx(0.3) == course.marks()["commands"][1, 0]
     assert course.named(course.states(), [1]) == {"skill/robot 2": "walk"}
     assert course.columns()["commands_done"] == [3, 3]

@@ -35,7 +35,7 @@ def random_motion():
 
 
 def table_of(motion):
-    """Return the columns (ROWS,) of a motion by name: time in ms, angles in degrees, currents instead of torques."""
+    """Return the columns (ROWS,) of a motion by name: time in ms, angles in degrees, targets in rad, currents."""
     columns = {"time [ms]": 1000.0 * motion.time}
     for i, joint in enumerate(MOTOR_JOINTS):
         columns[f"target/{joint}"] = motion.target[:, i]

@@ -20,6 +20,9 @@ def box(low, high):
 
 
 def coal_distance(a, b):
-    """Return the signed distance [m] of two (shape, placement, radius), at least minus the sum of the radii."""
+    """Return the signed distance [m] of two (shape, placement, radius).
+
+    It is at least minus the sum of the radii, as the kernels', which measure between the cores of rounded shapes.
+    """
     result = coal.distance(a[0], a[1], b[0], b[1], coal.DistanceRequest(), coal.DistanceResult())
     return max(result, -a[2] - b[2])

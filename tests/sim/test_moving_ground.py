@@ -174,7 +174,7 @@ def test_sticking_paws_move_with_the_block():
         sim.physics_step()
         force, velocity = paw_forces(sim), sim.solver.block_velocity()
         slip = slip_velocities(sim, before)[..., XY] - velocity[:, None]
-        sticking = np.linalg.norm(force[..., XY], axis=-1) < 0.85 * force[..., Z]
+        sticking = np.linalg.norm(force[..., XY], axis=-1) < 0.85 * force[..., Z]  # paws have friction 0.9
         assert np.abs(slip[sticking]).max(initial=0.0) < 1e-3
         assert sim.solver.residual.numpy().max() <= TOLERANCE
         compared += sticking[:2].sum()

@@ -87,7 +87,7 @@ def test_first_commands_have_their_kinds_limits_and_durations(begun):
 
 
 def test_commands_of_the_last_level_shrink_sideways_with_the_speed_ahead(env):
-    edit(env, command_level=10, steps=0)
+    edit(env, command_level=10, steps=0)  # the widest commands; no step: the reset keeps the level
     env.reset()
     command = states_of(env)["command"]
     ahead, back, aside, turning = TASK.levels[0].last_range  # [m/s], [m/s], [m/s], [rad/s]
