@@ -36,11 +36,10 @@ class Label:
 
 
 def valid_frames(recording: Recording, rank: int) -> int:
-    """Return the number of frames before a world diverges: a pose is not finite, or FAR from its start."""
+    """Return the number of frames before a world diverges: a pose is not finite, or the base is FAR from its start."""
     poses = recording.body_poses(rank)
-    start = np.append(poses[0, 0, :3], np.zeros(4))
-    near = (np.abs(poses - start) < FAR).all(axis=(1, 2))  # false for NaN
-    return int(np.argmin(np.append(near, False)))
+    valid = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(poses[:, 0] - poses[0, 0])[:, :3] < FAR).all(axis=1)
+    return int(np.argmin(np.append(valid, False)))
 
 
 def without_divergence(recording: Recording) -> Recording:

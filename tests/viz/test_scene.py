@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from box_robot import RATE, STANDING, box_recording, pinhole, walk
+from jumper_warp.viz.props import with_blocks
 from jumper_warp.viz.renderer import View
 from jumper_warp.viz.scene import (
     ARROW_SECONDS,
@@ -17,6 +18,7 @@ from jumper_warp.viz.scene import (
     corners,
     fit,
     follow,
+    valid_frames,
     velocity_arrows,
 )
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR
@@ -147,3 +149,10 @@ def test_heading_is_in_the_upper_left_corner():
     rows, columns = ink(annotate(np.full((120, 200, 3), 160, np.uint8), view, [], "HH", 0.1))
     assert 0 < rows.min() and rows.max() < 30 and 0 < columns.min() and columns.max() < 50
     assert not ink(annotate(np.full((120, 200, 3), 160, np.uint8), view, []))[0].size
+
+
+def test_block_that_waits_far_away_is_no_divergence():  # courses keep their block 1 km away until it is needed
+    recording = box_recording(walk(0.5))
+    frames = len(recording.times)
+    centers, half, height = np.full((frames, 1, 2), 1000.0), np.full((1, 2), 0.5), np.array([0.05])  # [m]
+    assert valid_frames(with_blocks(recording, centers, half, height), 0) == frames
