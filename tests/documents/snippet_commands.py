@@ -135,6 +135,9 @@ class Commands:
                 self.made["logs"] = self.task = result[1]
                 self.check_values(result[0])
             return
+        if args[0] == "info" and "--task-module" in args:  # of a user's task
+            self.require(Path(args[args.index("--task-module") + 1]))
+            return
         task = None
         with contextlib.ExitStack() as stack:
             if args[0] in OPENED and args[1:] and args[1][0] != "-" and args[1:2] != ["robot"]:
