@@ -94,7 +94,7 @@ def settings_of(command: str) -> list[Any]:
 
 
 def options(flags: Iterable[Flag]) -> list[str]:
-    """Return the spellings of flags for completion, each once, and of the flags that every command has."""
+    """Return the spellings of flags that a shell completes: the given flags, and those that every command has."""
     given = (option for flag in flags for option in flag.options)
     return list(dict.fromkeys([*given, TASK_MODULE, "--help", "--help-all"]))
 

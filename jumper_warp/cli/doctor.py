@@ -86,7 +86,7 @@ def threads() -> dict[str, int]:
 
 
 def folders() -> dict[str, Path]:
-    """Return the working folder, and the caches of Warp and of Triton, by name."""
+    """Return the working folder, and the kernel caches of Warp and of Triton, by name."""
     import warp as wp
 
     triton = Path(os.environ.get("TRITON_CACHE_DIR", Path.home() / ".triton" / "cache"))
@@ -94,7 +94,7 @@ def folders() -> dict[str, Path]:
 
 
 def describe_folder(path: Path) -> dict[str, Any]:
-    """Return path, whether files can be written, the free space [byte], and for a cache its size [byte]."""
+    """Return a folder's path, whether files can be written, free space [byte], and for a cache its size [byte]."""
     exists = path.is_dir()
     existing = next(parent for parent in (path, *path.parents) if parent.is_dir())
     try:
@@ -116,7 +116,7 @@ def file_sizes(folder: Path) -> Iterator[int]:
 
 
 def opengl() -> dict[str, str | None]:
-    """Return the name of OpenGL for pictures, and the reason if there is none."""
+    """Return the name of the OpenGL implementation that draws pictures, and the reason if there is none."""
     from jumper_warp.viz.renderer import opengl_name
 
     try:
@@ -175,7 +175,7 @@ def one_line(error: Exception) -> str:
 
 
 def lines_of(content: dict[str, Any]) -> list[str]:
-    """Return the description of the installation as lines of text."""
+    """Return the state of the installation as lines of text."""
     commit = f"{content['commit'][:12]}{', changed' if content['dirty'] else ''}" if content["commit"] else "unknown"
     rows = {"commit": commit, "package": content["package"], "system": content["system"]}
     rows |= {name: version or "MISSING" for name, version in content["versions"].items()}
@@ -194,7 +194,7 @@ def lines_of(content: dict[str, Any]) -> list[str]:
 
 
 def device_text(device: dict[str, Any]) -> str:
-    """Return the result of a device as text."""
+    """Return the result of a device's check as text."""
     if device["error"]:
         return f"FAILED: {device['error']}"
     gpu = ""

@@ -71,7 +71,7 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
-    """Return the first argument, the policy; print the general help and exit with 0 if it is --help.
+    """Return the policy, the first command-line argument; print the general help and exit with 0 if it is --help.
 
     A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is
     missing or another flag.
@@ -87,7 +87,7 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
 
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
-    """Open a policy for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
+    """Load a policy or a training run for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
     from jumper_warp.utils.progress import phase
 
     with phase(f"opening {policy}"):
@@ -114,7 +114,7 @@ def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
 
 
 def parse(command: str, task: TaskCfg, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]) -> Any:
-    """Parse the flags of a command on a policy of a task into settings; args: the policy, then flags.
+    """Parse the flags of a command that runs a policy, and return the settings; args: the policy, then flags.
 
     kind: generic dataclass of the settings, such as `EvaluateCfg`. flags_of: returns the defaults of the task's flags.
     Raises UsageError: a flag belongs to other tasks only, or a setting is out of range.

@@ -45,18 +45,18 @@ class Flag(NamedTuple):
 
     @property
     def has_negative(self) -> bool:
-        """Whether there is a second flag with `no-` before the last part of the name."""
+        """Whether the flag has an opposite, with `no-` before the last part of its name."""
         return self.kind is bool and tyro.conf.FlagCreatePairsOff not in self.marks
 
     @property
     def options(self) -> list[str]:
-        """Spellings on the command line, with leading dashes: the flag and, for a switch, its opposite."""
+        """Spellings of the flag on the command line, with leading dashes: itself and, for a switch, its opposite."""
         negative = [re.sub(r"([^.]+)$", r"no-\1", self.name)] if self.has_negative else []
         return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
 
     @property
     def first_sentence(self) -> str:
-        """First sentence of the description, without its full stop."""
+        """First sentence of the flag's description, without its full stop."""
         return self.about.split(". ")[0].rstrip(".")
 
     @property
@@ -66,7 +66,7 @@ class Flag(NamedTuple):
 
 
 def list_flags(cfg: Any, prefix: str = "", group_about: str = "") -> list[Flag]:
-    """Return the flags of a dataclass, or of an instance with the defaults, in the order of its fields.
+    """Return the flags of a settings dataclass, or of an instance with the defaults, in the order of its fields.
 
     prefix: of all names, with its dot. group_about: of those that are not nested further.
     """
@@ -132,7 +132,7 @@ def metavar(kind: Any) -> str:
 
 
 def check_numbers(settings: Any) -> None:
-    """Raise InputError for a number in parsed flags that no machine can hold, or that is not finite.
+    """Raise InputError for a number in parsed flags that is too large or not finite.
 
     settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others.
     """
@@ -147,7 +147,7 @@ def check_numbers(settings: Any) -> None:
 
 
 def option_of(arg: str) -> str:
-    """Return the flag in an argument, as `--ppo.init-std` in `--ppo.init_std=1`; empty if the argument is a value."""
+    """Return the name of the flag in an argument, as `--ppo.init-std` in `--ppo.init_std=1`; empty for a value."""
     match = re.match(r"(--[A-Za-z][\w.-]*)(=|$)", arg)
     return match[1].replace("_", "-") if match else ""
 

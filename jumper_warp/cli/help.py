@@ -133,7 +133,7 @@ def wrap(text: str, indent: int = 0) -> str:
 
 
 def default_text(default: Any) -> str:
-    """Return a default as text; empty for None, and for a value that no flag can give."""
+    """Return a flag's default value as text; empty for None, and for a value that no flag can give."""
     if isinstance(default, bool):
         return "on" if default else "off"
     if isinstance(default, tuple):

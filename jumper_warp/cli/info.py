@@ -26,7 +26,7 @@ UNBROKEN = "\N{NO-BREAK SPACE}"  # Printed as a space
 
 
 class Column(NamedTuple):
-    """Column of the table of a policy's results."""
+    """Column of the table of results that `jumper info` prints for a policy."""
 
     title: str
     key: str  # Of the metric in metrics.json
@@ -125,7 +125,7 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _cell(key: str, metric: Mapping[str, Any] | None) -> str:
-    """Format a metric for a table: a rate in per cent, else the value with its unit; empty if undefined."""
+    """Format a metric as a cell of a table: a rate in per cent, else the value with its unit; empty if undefined."""
     if metric is None or metric["value"] is None:
         return ""
     if key.endswith("_rate"):

@@ -52,7 +52,7 @@ EXIT_CODES = "Exit codes: 0 done, 1 fault, 2 invalid input, 3 inconsistent fit, 
 
 
 class UsageError(InputError):
-    """Invalid command line; the message is one line."""
+    """Error: a command line is invalid. The message is one line."""
 
 
 def usage() -> str:
@@ -174,7 +174,7 @@ def parse(
 
 
 def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str:
-    """Return one line about arguments that tyro refused; printed: tyro's message in its box."""
+    """Return an error message of one line for arguments that tyro refused; printed: tyro's message in its box."""
     from jumper_warp.cli.flags import values_of
 
     printed = re.sub(r"\x1b\[[0-9;]*m", "", printed)  # colours, on a terminal

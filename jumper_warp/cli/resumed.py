@@ -44,7 +44,10 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
 
 
 def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
-    """Return a checkpoint's configuration. Raises CheckpointError: it has another task name or version, or none."""
+    """Return the configuration that a training run saved in a checkpoint.
+
+    Raises CheckpointError: it has another task name or version, or none.
+    """
     path = checkpoint.path
     try:
         saved = parse_json(checkpoint.state["config"], "config")

@@ -48,7 +48,7 @@ def flag_name(name: str) -> str:
 
 
 def _flag(value: Any, hint: Any, where: str) -> Setting | None:
-    """Return the flag or group of flags of a part of a task, None if it has none; where: its path, for messages."""
+    """Return the flag or group of flags for a part of a task, None if it has none; where: its path, for messages."""
     if isinstance(value, Term):
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
@@ -118,7 +118,7 @@ def with_flags(value: Any, flags: Any) -> Any:
 
 
 def _parts(value: Any) -> dict[str, Any]:
-    """Return the parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
+    """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
     if isinstance(value, Term):
         return {**value.numbers, **value.options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -129,7 +129,7 @@ def _parts(value: Any) -> dict[str, Any]:
 
 
 def _is_number(value: Any, hint: Any) -> bool:
-    """Return whether a setting holds numbers or a choice, or is optional: not a function, struct or name."""
+    """Return whether a setting can have a flag: it holds numbers or a choice, or is optional; no function or name."""
     if isinstance(value, str):
         return hint is not str
     if isinstance(value, tuple):

@@ -189,7 +189,7 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     from jumper_warp.envs.env import Env
 
     def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
-        """Return the environment, differentiable for trainer shac."""
+        """Return the training's environment, differentiable for trainer shac."""
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
         env = Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
@@ -219,7 +219,7 @@ def memory_message(task: TaskCfg, args: TrainArgs, error: Exception) -> str:
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
-    """Return the command line of a training without --resume and --init-policy, for a later resume.
+    """Return the command line that repeats a training, without --resume and --init-policy, for a later resume.
 
     args: after `jumper train`. modules: each becomes a --task-module with its file, or its name if it is in a package.
     """
@@ -236,7 +236,7 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
 
 def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
-    """Print one line about the time of a training on a CPU, unless it is short; presets: names of the task's."""
+    """Print the expected duration of a training on a CPU, unless it is short; presets: names of the task's."""
     from jumper_warp.rl.logger import format_duration
 
     cfg, done = args.cfg, args.checkpoint.state["iteration"] if args.checkpoint else 0

@@ -68,7 +68,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
-    """Return the size of `RolloutBuffer` for each world [byte], without log_std."""
+    """Return the size of PPO's rollout buffers for each world [byte], without log_std."""
     per_step = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # reward, done, timeout
     return FLOAT_BYTES * (num_steps * per_step + num_obs + num_critic_obs)  # observations after the last step
 
@@ -85,7 +85,7 @@ def free_main_memory() -> int:
 def memory_pools(
     task: TaskCfg, ppo: PpoCfg, solver: SolverName, device: torch.device, *, rebuilt: bool = False
 ) -> list[MemoryPool]:
-    """Return the memory of the machine and of a GPU with the need of a training by this process.
+    """Return main memory and GPU memory, each with its free size and what a training in this process needs of it.
 
     rebuilt: count memory that this process uses as free.
     """

@@ -94,7 +94,7 @@ class DeployedPolicy:
         return np.concatenate([self._term(name, term, values[name]) for name, term in self.layout.items()])
 
     def _reading(self, name: str, reading: Any) -> np.ndarray:
-        """Return a reading as (width,) float32. Raises InputError: it is of another size, or not finite."""
+        """Return a sensor reading as (width,) float32. Raises InputError: it is of another size, or not finite."""
         try:
             with np.errstate(over="ignore"):
                 value = np.atleast_1d(np.asarray(reading, dtype=np.float32))
@@ -144,7 +144,7 @@ class DeployedPolicy:
 
 
 def _verified(file: Path) -> bytes:
-    """Return the content of a policy's ONNX file.
+    """Return the content of a policy's ONNX file, after comparing it with its checksum.
 
     Raises InputError: it cannot be read, or differs from its checksum: in its metadata, or in the manifest of its
     policy folder.

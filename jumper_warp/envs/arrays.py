@@ -91,7 +91,7 @@ def scene_of(sim: Simulation) -> Any:
 
 
 def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
-    """Return the tasks of an environment as a tuple, checked; task: a `TaskCfg` or several.
+    """Check that tasks fit one environment, and return them as a tuple; task: a `TaskCfg` or several.
 
     Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
     torque, over-speed protection or gravity; or a handover refers to another task.
@@ -121,7 +121,7 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 def prepared_tasks(
     tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool, robot: RobotOverlay | None = None
 ) -> tuple[tuple[TaskCfg, ...], bool]:
-    """Return tasks with the environment's randomisation and noise options applied, and whether any samples its ground.
+    """Return tasks with an environment's randomisation and noise options applied, and whether any samples its ground.
 
     Without randomize tasks are nominal, with it they have the ranges of the overlay `robot`. Without noise their
     observations are exact. Ground is sampled only with randomize and ground_may_vary.
@@ -137,7 +137,10 @@ def prepared_tasks(
 
 
 def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Return a policy action without gradient. Raises InputError: no floating-point tensor of this shape and device."""
+    """Check type, shape and device of a policy action, and return it without gradient.
+
+    Raises InputError: no floating-point tensor of this shape and device.
+    """
     if not isinstance(action, torch.Tensor):
         raise InputError(f"an action must be a torch tensor, got {type(action).__name__}")
     if tuple(action.shape) != shape:
@@ -174,7 +177,7 @@ def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray
 
 
 def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
-    """Return each world's task index, (num_envs,) int32; skill: one index, or (num_envs,). Raises InputError."""
+    """Return a checked task index for each world, (num_envs,) int32; skill: one, or (num_envs,). Raises InputError."""
     array = np.asarray(skill)
     if array.shape not in ((), (num_envs,)) or array.dtype.kind not in "iu":
         raise InputError(f"skill must be one int or {num_envs} ints, got {array.dtype} of shape {array.shape}")
@@ -184,7 +187,7 @@ def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
 
 
 def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return a selection of worlds as float32 mask; worlds: (num_envs,) bool or None for all. Raises InputError."""
+    """Return selected worlds as a float32 mask; worlds: (num_envs,) bool or None for all. Raises InputError."""
     if worlds is None:
         return np.ones(num_envs, dtype=np.float32)
     array = np.asarray(to_numpy(worlds))
@@ -194,7 +197,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 
 def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return a selection of worlds as float32 mask; worlds: (num_envs,) bool or distinct indices. Raises InputError."""
+    """Return the selected worlds as a float32 mask; worlds: (num_envs,) bool or distinct indices. Raises InputError."""
     array = np.asarray(to_numpy(worlds))
     if array.dtype.kind not in "iu":
         return checked_mask(array, num_envs)
@@ -207,8 +210,9 @@ def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
 
 
 def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
-    """Return commands as float32 (num_envs, 4), padded with 0; mask: (num_envs,), nonzero for worlds to command.
+    """Check commands of tasks, and return them as float32 (num_envs, 4), padded with 0.
 
+    mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
     array, n, errors = as_float32(commands, "commands"), len(mask), []

@@ -66,7 +66,7 @@ class WorldCamera:
             self._renderer = None
 
     def _follow(self, bases: np.ndarray) -> None:
-        """Move the camera's targets and origins to the robots; bases: positions (count, 3) [m], world frame."""
+        """Move camera targets and drawing origins to the robots; bases: positions (count, 3) [m], world frame."""
         targets = bases + np.clip(self._targets - bases, -DEAD_ZONE, DEAD_ZONE)
         jumped = np.abs(self._targets - bases).max(axis=1) > NEAR  # also at the first image
         self._targets = np.where(jumped[:, None], bases, targets)
@@ -74,7 +74,7 @@ class WorldCamera:
         self._origins[far] = PERIOD * np.round(bases[far, :2] / PERIOD)
 
     def _present_scenery(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return parameters of each world's scenery, (count, 5) [m], and centres of blocks, (count, 2) [m].
+        """Return place and size of each world's scenery, (count, 5) [m], and centres of blocks, (count, 2) [m].
 
         Columns: origin x, y of the drawn part of a heightfield; half extents x, y and height of the block, or 0.
         """
@@ -137,7 +137,7 @@ class WorldCamera:
         return field, (shift_x, shift_y, 0.0)
 
     def _image(self, renderer: Renderer, rank: int, links: np.ndarray, block: np.ndarray) -> np.ndarray:
-        """Return the image of a world; links: poses (21, 7), block: centre (2,) [m], world frame."""
+        """Draw a world, and return its image; links: poses (21, 7), block: centre (2,) [m], world frame."""
         poses = np.zeros((self._num_links + 2 * self._count, 7))
         poses[:, 6], poses[self._num_links :, 2] = 1.0, BELOW
         origin, body = self._origins[rank], self._num_links + 2 * rank

@@ -280,7 +280,7 @@ class Env(Stages):
 
     @locked
     def command(self, commands: Any, worlds: Any = None) -> None:
-        """Set commands within running episodes and update `obs`.
+        """Set the tasks' commands (such as goals or velocities) within running episodes, and update `obs`.
 
         commands: as in `evaluation_reset`, relative to the current base position and yaw; worlds: (num_envs,) bool, by
         default all. Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
@@ -291,7 +291,7 @@ class Env(Stages):
 
     @locked
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
-        """Request that worlds hand over to another skill as soon as the condition of a handover holds.
+        """Request that worlds switch to another skill as soon as the condition of a handover holds.
 
         skill: index of the task. worlds: (num_envs,) bool, by default all. commands: as in `evaluation_reset`, set at
         the handover relative to the base position and yaw of that moment; by default the handover's `begin` sets one.
@@ -354,7 +354,7 @@ class Env(Stages):
 
     @locked
     def metrics(self) -> dict[str, float]:
-        """Return metrics by name since the last call, see `TaskRuntime.metrics`, and clear the counters.
+        """Return training metrics by name since the last call, see `TaskRuntime.metrics`, and clear the counters.
 
         Waits for the device. Names of tasks other than the first begin with the task's name and a slash.
         """

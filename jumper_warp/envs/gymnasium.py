@@ -193,7 +193,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ClosedEnvironmentError("the environment is closed")
 
     def _checked_mask(self, options: dict[str, Any]) -> Any:
-        """Return a reset's mask of worlds from its options, or None. Raises InputError: other options, or no mask."""
+        """Return a checked mask of worlds to reset, or None. Raises InputError: other options, or no mask."""
         mask = options.pop("reset_mask", None)
         if options:
             raise InputError(f"reset takes no options but 'reset_mask', got {', '.join(map(repr, options))}")
@@ -275,7 +275,7 @@ class GymEnv(gymnasium.Env):
 
 
 def _first(obs: Obs) -> Any:
-    """Return the observation of the first world."""
+    """Return the first world's observation, from observations of all worlds."""
     return {group: values[0] for group, values in obs.items()} if isinstance(obs, dict) else obs[0]
 
 

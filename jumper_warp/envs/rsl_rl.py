@@ -18,7 +18,7 @@ class EnvConfig(dict):
     """Configuration of an environment, in the form that rsl-rl's loggers expect."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entries as a plain dict."""
+        """Return the configuration's entries as a plain dict."""
         return dict(self)
 
 

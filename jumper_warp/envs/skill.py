@@ -76,7 +76,7 @@ class TaskRuntime:
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:
-        """Allocate the observation arrays, their torch views by group, and the index table of components."""
+        """Allocate observation arrays, their torch views by group, and a table of each component's settings."""
         n, task = self.num_envs, self.task
         layouts = {group: task.layout(group) for group in task.groups}
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
@@ -146,7 +146,7 @@ class TaskRuntime:
         return values_by_term
 
     def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
-        """Return torch views (num_envs, columns) by group; array: flat, group after group; widths: columns by group."""
+        """Return torch views (num_envs, columns) of observations by group; array: flat, group after group."""
         flat, first, views = wp.to_torch(array), 0, {}
         for group, width in widths.items():
             views[group] = flat[first : first + self.num_envs * width].view(self.num_envs, width)
@@ -154,7 +154,7 @@ class TaskRuntime:
         return views
 
     def settings_of_skill(self) -> Any:
-        """Return the task's constants for the kernels: action scale, command filter, margins."""
+        """Return the task's constants as a kernel struct: action scale, command filter, margins."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
         settings.action_scale = vec12(*(4 * (lateral, transversal, transversal)))
@@ -167,7 +167,7 @@ class TaskRuntime:
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:
-        """Change parameters of term `section.name`, each as `Env.set` does; raises InputError as `Env.set`."""
+        """Change parameters, such as a weight, of term `section.name`; raises InputError as `Env.set`."""
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 

@@ -42,7 +42,7 @@ EVENT_BLOCKS = 264
 
 
 def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, int]]:
-    """Return the kernels of tasks and of all environments, each with its block size; the slowest compile first.
+    """Return the kernels that environments of given tasks launch, each with its block size; the slowest compile first.
 
     draws: include those of `reset`, else those of `evaluation_reset`.
     """
@@ -104,7 +104,7 @@ class Stages:
         ]
 
     def after_load_state(self) -> None:
-        """Update start flag, parameters of terms, and solver after `load_state` wrote the arrays.
+        """Update start flag, term parameters and solver after `load_state` wrote the environment's arrays.
 
         Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
         """
@@ -114,7 +114,7 @@ class Stages:
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return the kernels of a reset and of `step`, each with its block size; draws: as in `usual_kernels`."""
+        """Return the kernels that a reset and `step` launch, each with its block size; draws: as in `usual_kernels`."""
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
@@ -179,7 +179,7 @@ class Stages:
             self._launch(set_skill_kernel, part.count, [self._reset_mask, 0, part.episode])
 
     def _reset_done(self, part: WorldSlice) -> None:
-        """Hand over worlds where due, reset ended episodes (with auto_reset), and observe both again."""
+        """Switch worlds to another task where due, reset ended episodes (with auto_reset), and observe both again."""
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
@@ -188,7 +188,7 @@ class Stages:
             self._observe(part, after_reset=1)
 
     def _hand_over(self, part: WorldSlice) -> None:
-        """Perform the handovers that are due, at most one in a world."""
+        """Switch worlds from one task to another where a handover is due, at most once in a step."""
         if self._handovers:
             self._moved[part.first : part.first + part.count].zero_()
         for kernel, source, target in self._handovers:
@@ -212,7 +212,7 @@ class Stages:
         self._clear_history(part, mask)
 
     def _restore_first_task(self, part: WorldSlice, mask: wp.array) -> None:
-        """Reset worlds to their first skill and clear their requests where mask is nonzero."""
+        """Switch worlds back to their first task, and clear requests of other tasks, where mask is nonzero."""
         if len(self.skills) > 1:
             self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
@@ -274,7 +274,7 @@ class Stages:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
-        """Set commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad]."""
+        """Set tasks' commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad]."""
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(

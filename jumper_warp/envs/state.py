@@ -44,7 +44,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Restore a state of `save_state`, so that the following steps are bitwise the same.
+    """Restore a saved state of an environment, so that the following steps are bitwise the same.
 
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed or version.
     """
@@ -108,7 +108,7 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
 
 
 def nominal_fingerprint(env: Stages) -> torch.Tensor:
-    """Return the SHA-256 of all nominal parameters, (32,) uint8; it does not depend on the device."""
+    """Return the SHA-256 of all nominal robot parameters, (32,) uint8; it does not depend on the device."""
     digest = hashlib.sha256()
     for name in RobotParameters.vars:
         if name.startswith("nominal_"):
@@ -117,7 +117,7 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
 
 
 def _records(env: Stages) -> dict[str, wp.array]:
-    """Return the saved arrays of structs (task states, any blocks) by the prefix of their fields' keys."""
+    """Return an environment's arrays of structs (task states, any blocks) that are saved, by prefix of their keys."""
     blocks = env.sim.physics.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})

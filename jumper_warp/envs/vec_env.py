@@ -61,7 +61,7 @@ class VecEnv(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`, so that the following steps, without a `reset`, are the same.
+        """Restore a saved state of the environment, so that the following steps, without a `reset`, are the same.
 
         Raises ValueError: the state does not fit this environment.
         """
@@ -90,15 +90,15 @@ class DifferentiableVecEnv(VecEnv, Protocol):
         """Begin a window of differentiation: later derivatives do not reach actions before this call."""
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return differentiable `obs` and `critic_obs`; derivatives are 0 where an episode has just begun."""
+        """Return differentiable observations of actor and critic; derivatives are 0 where an episode just began."""
         ...
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return differentiable `final_obs` and `final_critic_obs` of the last step."""
+        """Return differentiable observations of actor and critic at the end of the last step, before resets."""
         ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance as `step`, resets included; return the reward (num_envs,), differentiable where its terms are."""
+        """Advance one policy step, with resets; return the reward (num_envs,), differentiable where its terms are."""
         ...
 
 

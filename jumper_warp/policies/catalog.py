@@ -99,7 +99,7 @@ def newest_run(source: str | Path) -> str | Path:
 
 
 def _no_policy(text: str, path: Path) -> str:
-    """Return the message for a name or path that is no policy: the task's policies, or similar names."""
+    """Return the error message for a name or path that is no policy: the task's policies, or similar names."""
     if path.is_file():
         return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
     if len(path.parts) > 1 or path.suffix:
@@ -113,7 +113,7 @@ def _no_policy(text: str, path: Path) -> str:
 
 
 def summarise(folder: Path) -> PolicySummary:
-    """Return the summary of the policy in a folder. Raises PolicyError: it is no policy, or a file is malformed."""
+    """Return a policy's metrics and description. Raises PolicyError: it is no policy, or a file is malformed."""
     try:
         task = read_json(folder / CONFIG, "configuration")["interface"]["task"]
         size, readme, metrics = (folder / ONNX).stat().st_size, folder / README, folder / METRICS

@@ -70,12 +70,12 @@ class Conditions:
 
     @property
     def stream_seed(self) -> int:
-        """Seed of goals, headings and commands that are sampled on the host; see `purpose_seed`."""
+        """Random seed of goals, headings and commands that are sampled on the host; see `purpose_seed`."""
         return purpose_seed(self.stream, self.seed)
 
     @property
     def fixed_parameters(self) -> dict[str, Any]:
-        """Parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
+        """Robot parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
         values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
                   "sensor_offset": self.sensor_offset}  # fmt: skip
         return {name: value for name, value in values.items() if value is not None}

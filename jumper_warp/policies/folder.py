@@ -35,7 +35,7 @@ FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a poli
 def save_policy(
     folder: Path, policy: Policy, *, files: Mapping[str, bytes] | None = None, overwrite: bool = False
 ) -> Path:
-    """Write a policy's folder atomically, and return its path.
+    """Write a policy to a folder atomically, and return the folder's path.
 
     Commit and versions are added to the configuration if it has none. files: content of additional files by name.
     overwrite: whether to replace an existing policy with all its files.
@@ -68,7 +68,7 @@ def save_policy(
 
 
 def checked_folder(folder: Path) -> Path:
-    """Check the path of a policy's folder, and return it.
+    """Check that a path can be a policy's folder, and return it.
 
     Raises PolicyError: it has the suffix of a file.
     """

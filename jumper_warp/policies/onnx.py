@@ -133,7 +133,7 @@ def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def onnx_bytes(policy: Policy, config: Mapping[str, Any] | None = None) -> bytes:
-    """Return the ONNX file's content, validated and deterministic; arguments: see `onnx_model`."""
+    """Return a policy as the bytes of an ONNX file, validated and deterministic; arguments: see `onnx_model`."""
     model = onnx_model(policy, config)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 def task_of_policy(
     policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return the task in a policy's configuration; arguments and errors: see `restored_task`.
+    """Return the task that a policy was trained on, from its saved configuration.
 
+    Arguments and errors: see `restored_task`.
     Raises PolicyError also if the task's observation differs from the policy's.
     """
     task = restored_task(policy.config, modules, leave_out=leave_out)

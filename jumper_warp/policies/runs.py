@@ -57,7 +57,7 @@ def _rsl_rl_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
-    """Return a policy on a device; name and errors: as `open_policy`."""
+    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `open_policy`."""
     return open_policy(name).to(device)
 
 
@@ -164,13 +164,13 @@ class CheckpointContents:
 
 
 def _with_source(config: dict[str, Any], iteration: int) -> dict[str, Any]:
-    """Return a run's configuration with the flat entries `commit`, `dirty` and `iteration` of a policy."""
+    """Return a run's configuration with code version (`commit`, `dirty`) and `iteration` as a policy saves them."""
     commit = config.get("commit") or {"hash": None, "dirty": None}
     return {**config, "commit": commit["hash"], "dirty": commit["dirty"], "iteration": iteration}
 
 
 def _policy_of_rsl_rl(path: Path) -> Policy:
-    """Return the policy of a checkpoint of rsl-rl. Raises PolicyError or CheckpointError, with its path."""
+    """Load the policy in a checkpoint file of rsl-rl. Raises PolicyError or CheckpointError, with its path."""
     file = path.parent / CONFIG
     if not file.exists():
         raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config")
@@ -179,7 +179,7 @@ def _policy_of_rsl_rl(path: Path) -> Policy:
 
 
 def _policy_of_checkpoint(path: Path, read: Callable[[], CheckpointContents]) -> Policy:
-    """Return the policy of a checkpoint's contents. Raises PolicyError or CheckpointError, with its path."""
+    """Build the policy from a checkpoint's contents. Raises PolicyError or CheckpointError, with its path."""
     try:
         return read().policy()
     except PolicyError as error:
@@ -204,7 +204,7 @@ def _actor_layers(model: dict[str, Any], prefix: str = "actor.") -> Weights:
 
 
 def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
-    """Return the mirror maps of a symmetric actor from a model's state_dict; None if it is a plain network."""
+    """Return the left-right mirror maps of a symmetric actor from a model's state_dict; None for a plain network."""
     if not any(name.startswith("mirror_") for name in model):
         return None
     parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)

@@ -22,7 +22,7 @@ WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a h
 
 @dataclass(frozen=True)
 class SkillNames:
-    """Names or folders of the policies of the three skills."""
+    """Names or folders of three policies: for walking, for vertical jumps and for horizontal jumps."""
 
     walk: str = "walking_flat"  # Policy that follows commanded velocities
     jump_up: str = "vertical_jump"  # Policy that jumps to a commanded height
@@ -30,7 +30,7 @@ class SkillNames:
 
 
 class SkillPolicies:
-    """Policies of the three skills, in the order WALK, JUMP_UP, JUMP_TO; `env` makes the environment that they act in.
+    """Policies for walking, vertical and horizontal jumps (WALK, JUMP_UP, JUMP_TO); `env` makes their environment.
 
     sources, policies, tasks: name, policy and task of each; skills, handovers: tasks in the conditions of the last
     `env`, and the conditions for a change of the skill.

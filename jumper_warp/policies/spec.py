@@ -204,7 +204,7 @@ def make_interface(
     hidden: tuple[int, ...],
     activation: str = "elu",
 ) -> PolicyInterface:
-    """Return the interface of policies for a task.
+    """Return the interface (observation, action, motors, time steps) of policies for a task.
 
     description: result of `jumper_warp.tasks.interface.interface`. policy_dt, physics_dt: [s]. hidden: widths of the
     hidden layers. activation: elu, relu or tanh. Raises PolicyError: a field is missing, unknown or invalid.

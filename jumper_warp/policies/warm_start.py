@@ -34,7 +34,7 @@ def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Ac
 
 
 def task_symmetry(task: TaskCfg) -> Symmetry:
-    """Return the mirror maps of a task's actor observation and action."""
+    """Return the left-right mirror maps of a task's actor observation and action."""
     return Symmetry(mirror_map(*mirror_of(task, "actor"), "observation"), mirror_map(*mirror_of_action(), "action"))
 
 

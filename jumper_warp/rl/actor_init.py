@@ -20,7 +20,7 @@ SYMMETRY_TOLERANCE = 0.05
 
 
 class ActorInit(NamedTuple):
-    """Initial weights and observation statistics of an actor."""
+    """Weights and observation statistics (mean, standard deviation) with which the training of an actor starts."""
 
     layers: Weights  # weight (out, in) and bias (out,) of each layer
     mean: torch.Tensor  # (num_obs,) mean of raw observations
@@ -87,7 +87,7 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
 
 
 def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Project a policy to the nearest symmetric actor, and return its layers, of half the widths.
+    """Return the layers, of half the widths, of the left-right symmetric actor that is nearest to a policy's network.
 
     Returns None if the layers are not nearly mirror-symmetric, or the observation statistics are not symmetric.
     """
@@ -103,7 +103,7 @@ def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, s
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether a network's layers are those of a mirror-symmetric actor, as `expand_layers` returns."""
+    """Return whether a network's layers are those of a left-right symmetric actor, written as a plain network."""
     try:
         contract_layers(layers, symmetry)
     except InputError:
@@ -126,7 +126,7 @@ def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: 
 def rescale_inputs(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, new_mean: torch.Tensor, new_std: torch.Tensor
 ) -> Weights:
-    """Adapt a network to other observation statistics, with unchanged outputs; return its layers (float64).
+    """Return a network's layers (float64) adapted to another normalisation of its inputs, with unchanged outputs.
 
     mean, std: with which observations were normalised; new_mean, new_std: with which they will be.
     All statistics are (num_obs,). Only the first layer changes: W (x - mean) / std + b stays the same for all x.

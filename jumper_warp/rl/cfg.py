@@ -33,7 +33,7 @@ LATEST, LATEST_OR_NEW = "latest", "latest-or-new"  # Values of `TrainCfg.resume`
 
 @dataclass(frozen=True)
 class PpoCfg:
-    """Settings of PPO; a task can have its own defaults (`registry.TASKS`)."""
+    """Settings of proximal policy optimisation (PPO); a task can have its own defaults (`registry.TASKS`)."""
 
     num_steps: int = 32
     """Policy steps of each world per iteration."""
@@ -105,7 +105,7 @@ class PpoCfg:
             raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
 
     def batch_size(self, num_envs: int) -> int:
-        """Return the number of samples in an iteration of num_envs worlds, num_steps · num_envs.
+        """Return the number of samples that an iteration collects in num_envs worlds, num_steps · num_envs.
 
         Raises InputError: there is only one sample, or the minibatches do not divide the samples.
         """
@@ -150,7 +150,7 @@ class ShacCfg:
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """Settings of a training: task, length, files, trainer and its hyperparameters."""
+    """Settings of a policy's training: task, length, files, trainer and its hyperparameters."""
 
     task: str = "vertical-jump"
     """Name of the task, also of the folder of its runs."""

@@ -24,11 +24,11 @@ DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeErro
 
 
 class CheckpointError(InputError):
-    """Error: a checkpoint cannot be used. The message is one line."""
+    """Error: a training checkpoint cannot be used. The message is one line."""
 
 
 class Checkpoint(NamedTuple):
-    """Loaded checkpoint: its path and contents, and the newer ones that cannot be used."""
+    """Loaded training checkpoint: its path and contents, and the newer ones that cannot be used."""
 
     path: Path
     state: dict[str, Any]  # contents, with at least the keys of REQUIRED
@@ -37,7 +37,7 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, max_checkpoints: int = 3) -> Path:
-    """Save a state as `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
+    """Save a training's state as the file `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
 
     folder: created if missing. state: tensors, numbers and strings, with at least the keys of REQUIRED. score: higher
     is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest checkpoints
@@ -65,7 +65,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Return the state that `save_checkpoint` saved, on the CPU.
+    """Return the training state in a checkpoint file of this package, with all tensors on the CPU.
 
     Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint; or its iteration
     differs from the manifest.
@@ -89,7 +89,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def load_foreign_checkpoint(path: Path) -> Any:
-    """Return the tensors, numbers and text of another program's checkpoint, on the CPU.
+    """Return the tensors, numbers and text in a checkpoint file of another program, such as rsl-rl, on the CPU.
 
     Raises CheckpointError: the file cannot be read, or holds something else.
     """
@@ -97,7 +97,7 @@ def load_foreign_checkpoint(path: Path) -> Any:
 
 
 def _decoded(path: Path, data: bytes) -> Any:
-    """Return the tensors, numbers and text in a checkpoint's data, on the CPU. Raises CheckpointError."""
+    """Decode a checkpoint file's bytes; return its tensors, numbers and text, on the CPU. Raises CheckpointError."""
     try:
         return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle raises anything
@@ -110,7 +110,7 @@ def one_line_message(error: Exception) -> str:
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
-    """Return the last saved checkpoint that can be loaded. Raises CheckpointError: there is none."""
+    """Load the last undamaged checkpoint in a folder, and return it. Raises CheckpointError: there is none."""
     manifest = _read_manifest(folder)
     skipped: list[str] = []
     for name in reversed(manifest):
@@ -122,7 +122,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
 
 
 def newest_name(folder: Path) -> str:
-    """Return the file name of the last saved checkpoint, usable or not. Raises CheckpointError: there is none."""
+    """Return the file name of a folder's newest checkpoint, usable or not. Raises CheckpointError: there is none."""
     if not (manifest := _read_manifest(folder)):
         raise CheckpointError(f"{folder}: no checkpoint")
     return list(manifest)[-1]
@@ -137,13 +137,16 @@ def best_checkpoint(folder: Path) -> Path:
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
-    """Return the file name of the checkpoint with the highest finite score; None if there is none."""
+    """Return the file name of the checkpoint with the highest finite score in a manifest; None if there is none."""
     scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)
 
 
 def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str, Any]]:
-    """Return the manifest's entries by file name, in the order of saving. Raises CheckpointError: it is unreadable."""
+    """Return the manifest of a folder of checkpoints: entries by file name, in the order of saving.
+
+    Raises CheckpointError: it is unreadable.
+    """
     path = folder / MANIFEST
     if missing_ok and not path.exists():
         return {}

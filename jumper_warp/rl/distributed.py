@@ -68,7 +68,7 @@ def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:
 
 
 class Rank(NamedTuple):
-    """Rank, world size and device of this process."""
+    """Identity of this training process: its rank (index), the number of processes, and its device."""
 
     index: int  # 0 for the process that logs and saves
     size: int  # number of processes

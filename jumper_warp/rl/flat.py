@@ -22,7 +22,7 @@ def aligned(count: int, to: int) -> int:
 
 
 class Segment(NamedTuple):
-    """Location of one parameter in a flat vector."""
+    """Location and shape of one parameter tensor in the flat vector of all parameters."""
 
     start: int  # index of its first entry
     padded_shape: tuple[int, ...]  # shape with zero-padded columns
@@ -44,8 +44,9 @@ class Segment(NamedTuple):
 
 
 class FlatParameters:
-    """Flat vectors of an `ActorCritic`: its parameters are views of `value`, their gradients views of `gradient`.
+    """All parameters of an `ActorCritic` in one flat vector, `value`, and their gradients in another, `gradient`.
 
+    The model's parameters are views of them.
     Order: actor, noise (log_std), critic. The padding between parameters is zero and stays zero.
     """
 
@@ -83,7 +84,7 @@ class FlatParameters:
 
 
 def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
-    """Return the gradients of consecutive parameters, in their padded shapes, as one slice of the flat vector."""
+    """Join the gradients of consecutive parameters, with their padding, to one slice of the flat gradient vector."""
     pieces = []
     for gradient in gradients:
         pieces.append(gradient.flatten())
@@ -98,7 +99,7 @@ def _layers(params: list[torch.Tensor], activation: str) -> Layers:
 
 
 class AdamVectors(NamedTuple):
-    """Parameters, gradient and state of Adam; all vectors are (size,) in the order of `FlatParameters.value`."""
+    """Tensors of the Adam optimiser (parameters, gradient, state), in the order of `FlatParameters.value`."""
 
     value: torch.Tensor  # (size,) parameters
     gradient: torch.Tensor  # (size,) of the loss
@@ -119,7 +120,7 @@ class FlatAdam:
         self.vectors = AdamVectors(flat.value, flat.gradient, self.exp_avg, self.exp_avg_sq, self.step, self.lr)
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:
-        """Return copies of each parameter's state by its index, in the format of `torch.optim.Adam`."""
+        """Return copies of Adam's state of each parameter by its index, in the format of `torch.optim.Adam`."""
         return {
             index: {
                 "step": self.step.clone(),
@@ -138,7 +139,7 @@ class FlatAdam:
 
 
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
-    """Adapt the learning rate () to the KL divergence of the policy update.
+    """Return the learning rate () adapted to the KL divergence of the policy update.
 
     It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A smaller kl
     than 1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within
@@ -166,7 +167,7 @@ def clip_gradient(gradient: torch.Tensor, actor_size: int, max_norm: float) -> t
 
 
 def adam_step(vectors: AdamVectors) -> None:
-    """Update parameters and state in place by one step of Adam (Kingma & Ba 2015, algorithm 1)."""
+    """Update parameters and Adam's moments in place by one step of Adam (Kingma & Ba 2015, algorithm 1)."""
     value, gradient, exp_avg, exp_avg_sq, step, lr = vectors
     step.add_(1.0)
     exp_avg.lerp_(gradient, 1.0 - BETAS[0])

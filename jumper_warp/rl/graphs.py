@@ -38,7 +38,7 @@ class CapturedProcedure:
             self._warm = True
 
     def _capture(self) -> None:
-        """Capture the procedure as a graph, or disable capture on all ranks."""
+        """Capture the procedure as a CUDA graph; if that fails on any rank, disable capture on all ranks."""
         torch.cuda.synchronize()
         wait_for_ranks()  # no collective of an eager call may be in progress on any rank
         graph, reason = torch.cuda.CUDAGraph(), ""

@@ -21,7 +21,7 @@ from jumper_warp.utils.progress import format_duration
 
 
 class Stopwatch:
-    """Stopwatch for the device time of the parts of an iteration (lap); only `read` synchronises with the device."""
+    """Stopwatch for the device time of each part of a training iteration (lap); only `read` waits for the device."""
 
     def __init__(self, device: torch.device) -> None:
         """Measure the time of `device`, with CUDA events on a GPU and the host's clock on a CPU."""
@@ -29,7 +29,7 @@ class Stopwatch:
         self._laps: list[list[Any]] = []  # marks of each lap: CUDA events, or times [s]
 
     def start(self) -> None:
-        """Begin a lap and its first part."""
+        """Begin a lap (iteration) and its first part."""
         self._laps.append([])
         self.mark()
 
@@ -132,12 +132,12 @@ class TrainingLog:
             self.check_rate(metrics["Perf/total_fps"])
 
     def print_speed(self, rate: float, remaining: float) -> None:
-        """Print the measured step rate [1/s] and the estimated time to the end [s]; as `check_rate` if it is low."""
+        """Print the measured step rate [1/s] and the estimated time to the end [s]; warn if the rate is low."""
         self.print_line(f"measured speed: {rate:,.0f} steps/s, about {format_duration(remaining)} left")
         self.check_rate(rate)
 
     def check_rate(self, rate: float) -> None:
-        """Print one line, once, if the step rate [1/s] is less than half of the expected one."""
+        """Print a warning, once, if the step rate [1/s] is less than half of the expected one."""
         if 2.0 * rate < self._expected_rate:
             usual = f"below {self._expected_rate / 2.0:,.0f} steps/s, {self._expected_rate:,.0f} are usual on two cores"
             waiting = ", or restart with OMP_NUM_THREADS=1, since torch's threads wait for them"
@@ -151,7 +151,7 @@ class TrainingLog:
         self._events = None
 
     def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
-        """Write TensorBoard events; the first failure disables them."""
+        """Write an iteration's metrics as TensorBoard events; the first failure disables events."""
         if not self._events:
             return
         try:
@@ -200,7 +200,7 @@ def _event_writer(folder: Path, iteration: int) -> Any:
 
 
 def _wandb(folder: Path, config: dict[str, Any]) -> Any:
-    """Return a new run of Weights & Biases. Raises InputError: it is not installed."""
+    """Start a run of Weights & Biases for a training, and return it. Raises InputError: it is not installed."""
     try:
         wandb = importlib.import_module("wandb")
     except ImportError as error:

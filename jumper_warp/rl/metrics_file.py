@@ -13,10 +13,10 @@ METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object p
 
 
 class MetricsFile:
-    """Metrics file with atomic appends; lines that could not be written are appended with the next one."""
+    """File of a training's metrics with atomic appends; lines that were not written are appended with the next one."""
 
     def __init__(self, path: Path, iteration: float) -> None:
-        """Open the file to continue after `iteration`; lines of later iterations and malformed lines are removed.
+        """Open the metrics file to continue after `iteration`; later iterations and malformed lines are removed.
 
         Raises OSError: the file cannot be read or written.
         """
@@ -52,7 +52,7 @@ class MetricsFile:
         self._size, self._pending = self._size + written, b""
 
     def move(self, path: Path) -> MetricsFile:
-        """Close the file, and return a copy of it that continues, also if this one was deleted. Raises OSError."""
+        """Copy the lines to `path`, close this file, even if it was deleted, and return the copy. Raises OSError."""
         self._file.seek(0)
         write_atomically(path, self._file.read())
         self.close()
@@ -66,7 +66,7 @@ class MetricsFile:
 
 
 def _iteration_of(line: bytes) -> float:
-    """Return the iteration of a line of metrics; infinity for a malformed line."""
+    """Return the iteration number in a line of a metrics file; infinity for a malformed line."""
     try:
         return int(json.loads(line)["iteration"])
     except (ValueError, KeyError, TypeError, RecursionError, OverflowError):

@@ -25,7 +25,7 @@ Vector = Sequence[float] | np.ndarray | torch.Tensor  # Numbers (n,) in any cont
 
 
 class MirrorMap(NamedTuple):
-    """Mirror map of vectors (..., n): a signed permutation that is its own inverse."""
+    """Left-right mirror map of vectors (..., n): a signed permutation that is its own inverse."""
 
     order: torch.Tensor  # (n,) int64, the entry of x that each entry of the image comes from
     signs: torch.Tensor  # (n,) float32, 1 or -1
@@ -35,7 +35,7 @@ class MirrorMap(NamedTuple):
         return self.signs * x[..., self.order]
 
     def symmetrise_moments(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and population variance (n,) of samples and their mirror images together.
+        """Return mean and population variance (n,) of samples together with their mirror images.
 
         mean, var: (n,) of the samples alone. The results are bitwise mirror-symmetric.
         """
@@ -54,13 +54,13 @@ class MirrorMap(NamedTuple):
 
 
 class Symmetry(NamedTuple):
-    """Mirror maps of the actor's observation and action."""
+    """Left-right mirror maps of the actor's observation and action."""
 
     obs: MirrorMap
     action: MirrorMap
 
     def padded(self, columns: int) -> Symmetry:
-        """Return the symmetry for observations that are padded to `columns` entries."""
+        """Return the mirror maps for observations that are padded to `columns` entries; the action's is unchanged."""
         return Symmetry(self.obs.padded(columns), self.action)
 
 
@@ -114,7 +114,7 @@ def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Project layers to the nearest symmetric actor, in the form of `expand_layers`, by least squared distance.
+    """Return the plain network's layers of the symmetric actor that is nearest to given layers, by least squares.
 
     layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, the others set to 0.
     """
@@ -132,7 +132,7 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Recover the symmetric actor's network, of half the widths, from the layers of `expand_layers`.
+    """Recover a symmetric actor's network, of half the widths, from the layers of its equivalent plain network.
 
     The result is a copy of the layers of f.
     f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.

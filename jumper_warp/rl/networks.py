@@ -28,7 +28,7 @@ ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}  # Activation mo
 
 
 class Moments(NamedTuple):
-    """Mean, population variance and count of a batch; mean and variance have the shape of one sample."""
+    """Mean, population variance and count of a batch of samples; mean and variance have the shape of one sample."""
 
     mean: torch.Tensor
     var: torch.Tensor  # population variance (divided by count, not count - 1)
@@ -36,7 +36,7 @@ class Moments(NamedTuple):
 
     @staticmethod
     def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
-        """Return the moments over the first axis of x (batch, ...).
+        """Return mean, population variance and count over the first axis of x (batch, ...).
 
         chunk_size: rows per chunk, in two passes, six times as fast on a CPU (default: all rows, in one pass).
         """
@@ -50,7 +50,7 @@ class Moments(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """Normalisation by mean and standard deviation, float32, each of one sample's shape."""
+    """Normalisation of samples by a mean and a standard deviation, float32, each of one sample's shape."""
 
     mean: torch.Tensor
     std: torch.Tensor
@@ -60,7 +60,7 @@ class Scaling(NamedTuple):
         return (x - self.mean) / self.std
 
     def denormalise(self, x: torch.Tensor) -> torch.Tensor:
-        """Undo `normalise`: return x · std + mean."""
+        """Return normalised values x in their original unit: x · std + mean."""
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
@@ -70,7 +70,7 @@ class Scaling(NamedTuple):
 
 
 def all_reduce_moments(local: Sequence[Moments]) -> list[Moments]:
-    """Combine moments over the batches of all ranks in one all-reduce, and return them as float64.
+    """Combine means and variances of the batches of all ranks in one all-reduce, and return them as float64.
 
     local: moments of quantities of any shape over this rank's batch, which has the same size on every rank. In float64
     the cancellation in E[x²] - E[x]² is negligible.
@@ -103,7 +103,7 @@ def gaussian_kl(
 
 
 class RunningMoments(nn.Module):
-    """Running mean and variance of all samples, float64 buffers; the initial scaling is the identity."""
+    """Running mean and variance of all samples so far, float64 buffers; the initial scaling is the identity."""
 
     mean: torch.Tensor  # shape of one sample
     var: torch.Tensor  # shape of one sample, population variance
@@ -118,12 +118,12 @@ class RunningMoments(nn.Module):
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
-        """Update the running moments with a batch of finite samples (batch, *shape) of every rank."""
+        """Update mean and variance with a batch of finite samples (batch, *shape) of every rank."""
         self.update_from_moments(all_reduce_moments([Moments.from_samples(x)])[0])
 
     @torch.no_grad()
     def update_from_moments(self, moments: Moments) -> None:
-        """Update the running moments with those of a batch of finite samples over all ranks."""
+        """Update mean and variance with the moments of a batch of finite samples, combined over all ranks."""
         mean, var, size = moments
         weight = size / (self.count + size)
         delta = mean - self.mean
@@ -163,7 +163,7 @@ class ActorCritic(nn.Module):
         self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0,
         num_critic_obs: int | None = None, symmetry: Symmetry | None = None,
     ) -> None:  # fmt: skip
-        """Create networks with random weights and empty statistics.
+        """Create actor and critic with random weights and without observation statistics.
 
         num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic. hidden: widths of
         the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial standard deviation of
@@ -184,7 +184,7 @@ class ActorCritic(nn.Module):
 
     @property
     def symmetry(self) -> Symmetry | None:
-        """Symmetry of the policy, on the device of the weights; None if it is not symmetric."""
+        """Left-right mirror maps of the policy, on the device of the weights; None if it is not symmetric."""
         if not self._symmetric:
             return None
         parts = [
@@ -208,7 +208,7 @@ class ActorCritic(nn.Module):
         return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
-        """Return the critic's output (...) [standard deviations of the return] for features (..., num_critic_obs)."""
+        """Return the critic's output (...) [std of the return] for normalised observations (..., num_critic_obs)."""
         return self.critic(critic_features).squeeze(-1)
 
     def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
@@ -222,7 +222,7 @@ class ActorCritic(nn.Module):
 
 
 class Layers(NamedTuple):
-    """Multilayer perceptron as tensors, with its forward and backward pass."""
+    """Weights and biases of a multilayer perceptron, with a forward and a backward pass without autograd."""
 
     weights: tuple[torch.Tensor, ...]  # (outputs, inputs) each; the first is zero-padded to `flat.ROW_ALIGNMENT`
     biases: tuple[torch.Tensor, ...]  # (outputs,) each
@@ -241,7 +241,7 @@ class Layers(NamedTuple):
         return functional.linear(x, self.weights[-1], self.biases[-1]), [*layer_inputs, x]
 
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
-        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias.
+        """Return the gradients of the loss with respect to each layer's weight and bias, by backpropagation.
 
         layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss with respect to the output.
         """
@@ -255,14 +255,14 @@ class Layers(NamedTuple):
 
 
 class ActorTensors(NamedTuple):
-    """Policy network as tensors, with its forward and backward pass; notation of `jumper_warp.rl.mirror`."""
+    """Policy network as tensors, with a forward and a backward pass; notation of `jumper_warp.rl.mirror`."""
 
     layers: Layers
     log_std: torch.Tensor  # (num_actions,) of the exploration noise
     symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor) -> ActorOutput:
-        """Return the policy's mean action for normalised observations x; arguments: see `Layers.forward`."""
+        """Compute the policy's mean action for normalised observations x; arguments: see `Layers.forward`."""
         if self.symmetry is None:
             mean, layer_inputs = self.layers.forward(x)
             return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
@@ -272,7 +272,7 @@ class ActorTensors(NamedTuple):
         return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
 
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
-        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias.
+        """Return the gradients of the loss with respect to each layer's weight and bias, by backpropagation.
 
         layer_inputs: from `forward`; grad: (batch, num_actions) gradient with respect to `ActorOutput.mean`.
         """
@@ -283,7 +283,7 @@ class ActorTensors(NamedTuple):
 
 
 class ActorOutput(NamedTuple):
-    """Output of a forward pass of the policy."""
+    """Result of the policy's forward pass: mean action, its left-right asymmetry, and the layers' inputs."""
 
     mean: torch.Tensor  # (batch, num_actions)
     difference: torch.Tensor  # (batch, num_actions) f(x) - N f(M x); 0 without symmetry
@@ -291,7 +291,7 @@ class ActorOutput(NamedTuple):
 
 
 def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Backward pass of an activation function: return the loss gradient with respect to its input.
+    """Return the gradient of the loss with respect to an activation function's input.
 
     grad: gradient with respect to its output; output: its output; all have the same shape.
     """

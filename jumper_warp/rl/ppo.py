@@ -35,7 +35,7 @@ from jumper_warp.utils.state_checks import check_parts, check_tensor, check_valu
 
 
 class ActorLosses(NamedTuple):
-    """Losses of the actor on a minibatch, each a scalar tensor ()."""
+    """PPO's surrogate loss, entropy, asymmetry and KL divergence on a minibatch, each a scalar tensor ()."""
 
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     entropy: torch.Tensor  # entropy of the policy [nat]
@@ -44,7 +44,7 @@ class ActorLosses(NamedTuple):
 
 
 class StepStatistics(NamedTuple):
-    """Statistics of an optimiser step, each (); losses and divergence are those at its start (`ActorLosses`)."""
+    """Losses, KL divergence and gradient norms at the start of an optimiser step, each () (see `ActorLosses`)."""
 
     surrogate: torch.Tensor
     value: torch.Tensor  # value loss before weighting [variances of the return]
@@ -60,7 +60,7 @@ STATISTICS = StepStatistics._fields  # Names of the statistics that `Ppo.statist
 
 
 class Ppo:
-    """PPO on one environment: `collect` fills the rollout, `update` optimises the networks, `iterate` does both."""
+    """PPO trainer: `collect` fills the rollout, `update` trains actor and critic on it, `iterate` does both."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build actor, critic and rollout buffers on the environment's device; weights follow torch's CPU seed.
@@ -95,14 +95,14 @@ class Ppo:
         self._roll, self._batch, self._optimise = (CapturedProcedure(each, cuda and cfg.graphs) for each in procedures)
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
-        """Run one iteration; mark: called after the launch of the rollout, and after the launch of the update."""
+        """Collect a rollout, and update the networks on it; mark: called after the launch of each of the two."""
         self.collect()
         mark()
         self.update()
         mark()
 
     def collect(self) -> None:
-        """Fill the rollout with the current policy."""
+        """Run the current policy in the environment, and record its steps in the rollout."""
         self._roll()
 
     def update(self) -> None:
@@ -115,8 +115,9 @@ class Ppo:
 
     @torch.no_grad()
     def batch(self) -> Batch:
-        """Return the rollout's samples, time-major, as views of `packer.rows`, and update the running statistics.
+        """Compute the rollout's training samples, return views of them, time-major, and update the running moments.
 
+        The views are of `packer.rows`.
         Also samples the order of the samples in every epoch.
         """
         self.packer.pack()
@@ -138,8 +139,9 @@ class Ppo:
 
     @torch.no_grad()
     def minibatch_step(self, rows: torch.Tensor) -> StepStatistics:
-        """Run one optimiser step, without host synchronisation; return its statistics, which `statistics` averages.
+        """Run one optimiser step on a minibatch, without host synchronisation; return its losses and gradient norms.
 
+        `statistics` averages them.
         rows: samples (batch, columns of `packer.layout`).
         """
         flat, packer, cfg = self.flat, self.packer, self.cfg
@@ -168,7 +170,7 @@ class Ppo:
         return take_averages(STATISTICS, self._sums, self.collector.finished, self.lr, self.model.log_std)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks with statistics (`model`), `optimiser`, `lr` and `episode` as nested dicts of tensors."""
+        """Return the training's state as nested dicts of tensors: `model`, `optimiser`, `lr` and `episode`."""
         model = self.model.state_dict()
         return {
             "model": {name: value.clone(memory_format=torch.contiguous_format) for name, value in model.items()},
@@ -178,7 +180,7 @@ class Ppo:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore networks, optimiser, learning rate and episode counts from the result of `state_dict`.
+        """Restore the training's state from the result of `state_dict`: networks, optimiser, rate and episode counts.
 
         Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
@@ -273,7 +275,7 @@ def optimiser_step(
     vectors: AdamVectors, actor_size: int, kl: torch.Tensor, desired_kl: torch.Tensor, cfg: PpoCfg, losses: ActorLosses,
     value_loss: torch.Tensor, sums: torch.Tensor,
 ) -> StepStatistics:  # fmt: skip
-    """Adapt the learning rate to the divergence kl (), clip the gradient, run Adam's step, and return its statistics.
+    """Adapt the learning rate to the divergence kl (), clip the gradient, run Adam's step, and return losses and norms.
 
     A non-finite gradient is replaced by 0. sums: (len(STATISTICS) + 1,) running sums of the statistics, and the number
     of steps; updated in place.

@@ -34,7 +34,7 @@ DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's confi
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Return the checkpoint that `TrainCfg.resume` names; None: new run. Raises CheckpointError: it cannot be used."""
+    """Load the checkpoint that `TrainCfg.resume` names; None: new run. Raises CheckpointError: it cannot be used."""
     if not cfg.resume:
         return None
     if cfg.resume in (LATEST, LATEST_OR_NEW):
@@ -62,7 +62,7 @@ def check_unchanged(checkpoint: Checkpoint) -> None:
 
 
 def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
-    """Return a rank's part of a checkpoint: `env`, `rng` and the per-rank part of `ppo`.
+    """Return the part of a checkpoint that one process (rank) restores: `env`, `rng` and its part of `ppo`.
 
     Raises InputError: another number of processes saved the checkpoint, or a part is missing.
     """
@@ -79,7 +79,7 @@ def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
 
 
 def saved_init_policy(state: dict[str, Any]) -> str | None:
-    """Return the policy that a checkpoint's run started from; None: random weights or unknown."""
+    """Return the policy from which the training that saved a checkpoint started; None: random weights or unknown."""
     try:
         settings = json.loads(state["config"])["train"]
         return str(settings["init_policy"]) if settings.get("init_policy") else None
@@ -133,7 +133,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def saved_seconds(state: dict[str, Any]) -> float:
-    """Return the training time [s] in a checkpoint, 0 if it has none. Raises InputError: it is malformed."""
+    """Return the training time [s] saved in a checkpoint, 0 if it has none. Raises InputError: it is malformed."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
         raise InputError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
@@ -149,7 +149,7 @@ def random_state() -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: dict[str, torch.Tensor]) -> None:
-    """Restore the result of `random_state`; the GPU's state only where there is a GPU.
+    """Set torch's default random generators to states from `random_state`; the GPU's only where there is a GPU.
 
     Raises InputError: a part is missing or not a generator's state; nothing is changed.
     """

@@ -13,7 +13,7 @@ from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
 
 
 class RolloutBuffer(NamedTuple):
-    """Transitions of all worlds over num_steps policy steps."""
+    """Transitions (observations, action, reward, end) of all worlds over num_steps policy steps."""
 
     obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
     critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs without `asymmetric_critic`
@@ -48,7 +48,7 @@ class Collector:
     """Collector of rollouts: steps the environment with the current policy, and records transitions in `rollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters) -> None:
-        """Allocate the rollout; model: has the observation statistics; flat: parameters of `model`."""
+        """Allocate the memory of a rollout; model: has the observation statistics; flat: parameters of `model`."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
@@ -64,7 +64,7 @@ class Collector:
 
     @torch.no_grad()
     def roll(self) -> None:
-        """Fill the rollout by acting for `num_steps` policy steps."""
+        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout."""
         env, rollout = self.env, self.rollout
         for scaling, value in zip(self._scaling, self._moments.scaling(), strict=True):
             scaling.copy_(value)
@@ -78,11 +78,11 @@ class Collector:
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
 
     def _act_step(self, step: RolloutBuffer) -> None:
-        """Write observations, mean and action for the environment's current state to `step` (`RolloutBuffer.at`)."""
+        """Sample actions for the current state; write them, mean and observations to `step` (`RolloutBuffer.at`)."""
         sample_action(self.env.obs, self._critic_obs, step, self._actor, self._scaling)
 
     def _record_step(self, step: RolloutBuffer) -> None:
-        """Write the result of the environment's last step to `step` (`RolloutBuffer.at`)."""
+        """Write the environment's last reward, end and final observation to `step` (`RolloutBuffer.at`)."""
         env, scale = self.env, self.cfg.reward_scale
         final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
         record_transition(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
@@ -107,7 +107,7 @@ def record_transition(
     reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
     step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
 ) -> None:  # fmt: skip
-    """Write reward, done, timeout and the critic's final observation to `step`, and update returns and lengths.
+    """Write reward, done, timeout and the critic's final observation to `step`; update returns and lengths of episodes.
 
     reward, done, timeout: (num_envs,), unscaled; final_critic_obs: (num_envs, n). episode: (2, num_envs) and finished:
     (3, num_envs), as in `Collector`, are updated in place with unscaled rewards.

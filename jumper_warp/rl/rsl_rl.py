@@ -14,7 +14,7 @@ from jumper_warp.rl.cfg import PpoCfg
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
-    """Return rsl-rl's configuration with the same settings, but no value normalisation and no reward scale.
+    """Return PPO settings as a configuration of rsl-rl, which has no value normalisation and no reward scale.
 
     The environment must have the observation groups `actor` and `critic`. save_interval: iterations per checkpoint.
     """
@@ -53,7 +53,7 @@ def train_rsl_rl(
     env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None,
     end_in: Callable[[int], Path | None] | None = None,
 ) -> OnPolicyRunner:  # fmt: skip
-    """Train with rsl-rl's PPO, and return its runner.
+    """Train a policy with rsl-rl's PPO, and return rsl-rl's runner.
 
     env: environment in rsl-rl's interface, already reset. folder: for checkpoints and TensorBoard events (None: no
     files). end_in: function of the number of iterations so far, called after each; a folder that it returns ends the

@@ -22,7 +22,7 @@ CONFIG = "config.json"  # File in a run's folder with all settings, versions and
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
-    """Return the folder of a new run, log_root/task/time of rank 0, the same on all ranks; rank 0 creates it."""
+    """Create the folder of a new training run, log_root/task/time, on rank 0, and return its path on all ranks."""
     (microseconds,) = all_reduce_max([time.time_ns() // 1000 if rank.index == 0 else 0])
     started = datetime.fromtimestamp(microseconds // 1_000_000).replace(microsecond=microseconds % 1_000_000)
     folder = cfg.log_root / cfg.task / started.strftime("%Y-%m-%d_%H-%M-%S_%f")
@@ -32,7 +32,7 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
-    """Return the configuration of a run as JSON data: settings, environment, versions, commit, user files."""
+    """Return the configuration of a training run as JSON data: settings, environment, versions, commit, user files."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     commit, env_config = git_commit(), env.config()
     return {
@@ -54,7 +54,7 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 def report_non_finite(
     env: VecEnv, folder: Path, config: dict[str, Any], iteration: int, print_line: Callable[[str], None], rank: int = 0
 ) -> list[NonFiniteValue]:
-    """Print a line about each term that is not finite for the first time, save its dump, and return the values.
+    """Print a line about each task term that is non-finite for the first time, save a dump, and return the values.
 
     config: of the run; rank: index of this process. A dump that cannot be written is reported in the line.
     """
@@ -71,8 +71,9 @@ def report_non_finite(
 
 
 def rescue_folder(folder: Path, config: dict[str, Any], names: Iterable[str]) -> tuple[Path, str]:
-    """Return a folder for the rest of a run, and a message, if one of its files `names` was deleted, else `folder`.
+    """Make a new folder for a training run if one of its files `names` was deleted; return the folder and a message.
 
+    If none was, return `folder` and an empty message.
     The new folder is made beside the old one, with the configuration. Raises OSError: it cannot be written.
     """
     lost = [name for name in names if not (folder / name).is_file()]

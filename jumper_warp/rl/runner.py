@@ -49,7 +49,7 @@ AsRslRl = Callable[[VecEnv, int], Any]
 
 
 class TrainResult(NamedTuple):
-    """Result of a training: its folder, length and last metrics."""
+    """Result of a training: the folder of the run, its length and last metrics."""
 
     folder: Path  # the run's folder
     iteration: int  # number of iterations, over all resumes
@@ -58,21 +58,21 @@ class TrainResult(NamedTuple):
 
 
 class StopRequest:
-    """Context manager in which Ctrl-C or SIGTERM sets `requested`; a second Ctrl-C raises KeyboardInterrupt."""
+    """Context manager that records Ctrl-C or SIGTERM as a request to stop; a second Ctrl-C raises KeyboardInterrupt."""
 
     def __enter__(self) -> StopRequest:
-        """Install the signal handlers."""
+        """Install handlers of Ctrl-C and SIGTERM that set `requested`."""
         self.requested = False
         self._previous = {each: signal.signal(each, self._on_signal) for each in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the previous handlers."""
+        """Restore the previous handlers of Ctrl-C and SIGTERM."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: set the request, and restore the default handler of Ctrl-C."""
+        """Handle Ctrl-C or SIGTERM: set the request, and restore the default handler of Ctrl-C."""
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -81,7 +81,7 @@ def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
     actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
 ) -> TrainResult:  # fmt: skip
-    """Train to the last iteration or the time limit, save a checkpoint, and return the result.
+    """Train a policy to the last iteration or the time limit, save a checkpoint, and return the result.
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
@@ -185,7 +185,10 @@ class TrainingRun:
             write_config(self.folder, self.config)
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
-        """Load a checkpoint, and return its run's folder. Raises CheckpointError: it does not fit the settings."""
+        """Restore networks, environment and random generators from a checkpoint; return its run's folder.
+
+        Raises CheckpointError: it does not fit the settings.
+        """
         path, state, skipped, _ = checkpoint
         changed = resume.changed_settings(state, self.config)
         self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
@@ -204,7 +207,7 @@ class TrainingRun:
         return path.parent.parent
 
     def iterate(self, stop: StopRequest) -> TrainResult:
-        """Iterate until the last iteration, the time limit or a stop request, with logging and checkpoints."""
+        """Train until the last iteration, the time limit or a stop request, with logging and checkpoints."""
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
             kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
@@ -258,31 +261,31 @@ class TrainingRun:
         return self.cfg.ppo.num_steps * self.cfg.num_envs
 
     def _limit(self) -> str:
-        """Return the limit that ends the training."""
+        """Return the limit that ends the training, as a flag such as `--max-iterations 500`."""
         ended = self.iteration >= self.cfg.max_iterations
         return f"--max-iterations {self.cfg.max_iterations}" if ended else f"--max-seconds {self.cfg.max_seconds:g}"
 
     def _reason(self, stop: StopRequest) -> str:
-        """Return the reason of the training's end, and the steps made if they are not all."""
+        """Return a text about why the training ends, with the steps made if they are not all."""
         done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
         steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
         return f"{'an interruption' if stop.requested else self._limit()}{steps}"
 
     def _mark(self, watch: Stopwatch, log: TrainingLog | _NoLog) -> None:
-        """End a part of an iteration; warn of a low step rate before a long first iteration has ended."""
+        """Mark the end of a part of an iteration for timing; warn of a low step rate in a long first iteration."""
         watch.mark()
         if self._clock_start is None and (seconds := watch.lap_time()) > WARM_UP:
             log.check_rate(self._steps() / seconds)
 
     def _print_speed(self, log: TrainingLog | _NoLog, watch: Stopwatch, is_first: bool) -> None:
-        """Print a CPU's speed; the time of the first iteration is discarded unless it is much longer than warm-up."""
+        """Print a CPU's training speed; the first iteration counts only if it takes much longer than warm-up."""
         times, seconds = watch.read()
         if not self._is_timed and (seconds > WARM_UP or not is_first):
             log.print_speed(self._steps() / sum(times), self._remaining(seconds))
             self._is_timed = True
 
     def _check(self, log: TrainingLog | _NoLog) -> None:
-        """Report terms that are not finite; set `failure` if one of them or a deleted folder ends the training."""
+        """Report NaN and infinite terms; set `failure` if one of them or a deleted run folder ends the training."""
         folder, print_line = self.folder, partial(print, file=sys.stderr)
         if isinstance(log, TrainingLog):
             print_line = log.print_line
@@ -360,7 +363,7 @@ class TrainingRun:
             log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 
     def _score(self) -> float | None:
-        """Return the metric that selects the best checkpoint; None while most worlds are below the last level."""
+        """Return the metric by which the best checkpoint is chosen; None while most worlds are below the last level."""
         levels = level_fractions(self.metrics)
         at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
         return self.metrics.get(self.cfg.best_metric) if not levels or at_end >= 0.5 else None
@@ -371,7 +374,7 @@ class TrainingRun:
         return f"{self._command} --resume {shlex.quote(str(self.folder))}"
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return the other ranks' states (env, rng, and of ppo the episode) on rank 0; an empty list elsewhere."""
+        """Gather the other ranks' states of environment, generators and episodes on rank 0; return [] elsewhere."""
         if distributed.world_size() == 1:
             return []
         return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
@@ -386,7 +389,7 @@ class _NoLog:
     """Null object for `TrainingLog` on all ranks but 0: it discards everything."""
 
     def __enter__(self) -> _NoLog:
-        """Return this log."""
+        """Return this log, which discards everything."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -406,7 +409,7 @@ class _NoLog:
 
 
 def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
-    """Train with rsl-rl's PPO; arguments, result and SystemExit: see `train`."""
+    """Train a policy with rsl-rl's PPO in a new run folder; arguments, result and SystemExit: see `train`."""
     if as_rsl_rl is None:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl

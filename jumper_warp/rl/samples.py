@@ -18,7 +18,7 @@ CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensor
 
 
 class Batch(NamedTuple):
-    """Training samples of one or all minibatches; the first axis is the sample."""
+    """Training samples of PPO: observations, actions, advantages and returns; the first axis is the sample."""
 
     features: torch.Tensor  # (batch, num_obs) normalised observations
     critic_features: torch.Tensor  # (batch, num_critic_obs) normalised observations of the critic
@@ -31,7 +31,7 @@ class Batch(NamedTuple):
 
 
 class RolloutMoments(NamedTuple):
-    """Moments (mean, variance, count) over the samples of a rollout."""
+    """Mean, variance and count of the advantages, returns and observations of a rollout."""
 
     advantage: Moments  # () each
     target: Moments  # () each
@@ -40,7 +40,7 @@ class RolloutMoments(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """Values, advantages and returns of a rollout; batch = num_steps · num_envs, time-major."""
+    """Values, advantages and returns of all steps of a rollout; batch = num_steps · num_envs, time-major."""
 
     value: torch.Tensor  # (batch,) the critic's output [standard deviations of the return]
     advantage: torch.Tensor  # (batch,) in scaled rewards
@@ -49,7 +49,7 @@ class Estimates(NamedTuple):
 
 
 class Scalings(NamedTuple):
-    """Normalisations of observations and values."""
+    """Means and standard deviations that normalise observations and returns."""
 
     obs: Scaling  # (num_obs,)
     critic_obs: Scaling  # (num_critic_obs,)
@@ -57,7 +57,7 @@ class Scalings(NamedTuple):
 
 
 class RowLayout(NamedTuple):
-    """Layout of a training sample in one row of memory: actor features, critic features, other data of `Batch`.
+    """Layout of one training sample in a row of memory: actor features, critic features, other data of `Batch`.
 
     Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once per iteration and gathered
     once per epoch.
@@ -74,21 +74,21 @@ class RowLayout(NamedTuple):
         return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
 
     def features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the actor's normalised observations in packed samples, zero-padded.
+        """Return the actor's normalised observations in rows of training samples, zero-padded.
 
         The result is (batch, columns of the first weight); rows: (batch, columns).
         """
         return rows[:, : self.widths[0]]
 
     def critic_features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the critic's normalised observations in packed samples, zero-padded.
+        """Return the critic's normalised observations in rows of training samples, zero-padded.
 
         The result is (batch, columns of the first weight); rows: (batch, columns).
         """
         return rows[:, self.widths[0] : sum(self.widths[:2])]
 
     def split(self, rows: torch.Tensor) -> Batch:
-        """Split packed samples (batch, columns) into the fields of `Batch`, as views without padding."""
+        """Split rows of training samples (batch, columns) into the fields of `Batch`, as views without padding."""
         sizes = (self.num_obs, self.widths[0] - self.num_obs, self.num_critic_obs, self.widths[1] - self.num_critic_obs,
                  self.num_actions, self.num_actions, 1, 1, 1, 1)  # fmt: skip
         starts = list(accumulate(sizes, initial=0))
@@ -97,7 +97,7 @@ class RowLayout(NamedTuple):
         return Batch(features, critic_features, action, mean, *(each[:, 0] for each in scalars))
 
     def pack(self, batch: Batch) -> torch.Tensor:
-        """Pack training samples into one zero-padded row each, (batch, columns); inverts `split`."""
+        """Join the fields of training samples to one zero-padded row each, (batch, columns); inverts `split`."""
         scalars = torch.stack([batch.log_prob, batch.value, batch.advantage, batch.target], dim=-1)
         groups = ([batch.features], [batch.critic_features], [batch.action, batch.mean, scalars])
         pieces: list[torch.Tensor] = []
@@ -132,13 +132,13 @@ def gae(
 
 
 class BatchPacker:
-    """Packer of a rollout into training samples with values, advantages and returns, one in each of `rows`."""
+    """Converter of a rollout to PPO's training samples, with advantages and returns, one in each row of `rows`."""
 
     def __init__(
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
         obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
-        """Allocate memory for the packed samples.
+        """Allocate memory for the training samples of a rollout.
 
         flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics.
         """
@@ -153,7 +153,7 @@ class BatchPacker:
 
     @torch.no_grad()
     def pack(self) -> None:
-        """Pack the rollout's samples into `rows`, and update the running statistics with them."""
+        """Compute advantages and returns, write the rollout's samples to `rows`, and update the running moments."""
         model = self._model
         scalings = self._scalings()  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
@@ -181,7 +181,7 @@ class BatchPacker:
         return compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Pack the rollout's samples and estimates into `rows`; arguments: see `write_rows`."""
+        """Write the rollout's samples with values, advantages and returns to `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         write_rows(
             self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
@@ -217,7 +217,7 @@ def write_rows(
     rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
     advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
-    """Pack the samples of a rollout into memory, one row per sample: rows (batch, columns of `layout`).
+    """Write a rollout's normalised training samples to memory, one per row: rows (batch, columns of `layout`).
 
     chunk_size: samples packed at a time (None: all).
     scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.

@@ -73,7 +73,7 @@ class Shac:
         """Do nothing; SHAC has no CUDA graphs (part of the interface of `Ppo`)."""
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
-        """Run one iteration; mark: called after the actor's and after the critic's update."""
+        """Update actor and critic on one window of simulation; mark: called after each of the two updates."""
         window = self.window()
         for group in self.optimisers["actor"].param_groups:
             group["lr"] = float(self.lr)
@@ -188,7 +188,7 @@ class Shac:
         return parts | {"lr": self.lr, "episode": self.episode}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of the tensors in `_parts` by name; `model.` is a nested dict under the key `model`."""
+        """Return copies of all tensors of the training state by name; `model` is a nested dict of the networks."""
         rest = {name: value.detach().clone() for name, value in self._parts().items() if not name.startswith("model.")}
         return {"model": {name: value.clone() for name, value in self.model.state_dict().items()}, **rest}
 

@@ -85,7 +85,7 @@ class ObservationsCfg:
 
 @dataclass(frozen=True)
 class TaskCfg(Copyable):
-    """Definition of a task: everything that an environment needs, as data."""
+    """Definition of a reinforcement-learning task: everything that an environment needs, as data."""
 
     name: str
     state: Any
@@ -155,11 +155,11 @@ class TaskCfg(Copyable):
         check_bounds(f"{self.name}:", self, TASK_BOUNDS)
 
     def without_margins(self) -> TaskCfg:
-        """Return the task with collision margins of 0 m, as in evaluation."""
+        """Return a copy of the task with collision margins of 0 m, as in evaluation."""
         return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
     def _check_structs(self) -> None:
-        """Raise InputError if the state, the settings of the reset or a level is no struct for kernels."""
+        """Raise InputError unless state, reset settings and levels have Warp structs for kernels."""
         if not isinstance(self.state, Struct):
             raise InputError(f"{self.name}: state must be a @wp.struct, got {self.state!r:.60}")
         steps = self.state.vars.get("steps")
@@ -198,7 +198,7 @@ class TaskCfg(Copyable):
         return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
-        """Return the half-open column range (first, end) of each term of an observation by its name.
+        """Return the half-open column range (first, end) of each term in the actor's or critic's observation, by name.
 
         group: "actor" or "critic".
         """
@@ -224,12 +224,12 @@ class TaskCfg(Copyable):
 
     @property
     def settings_type(self) -> Any:
-        """The `@wp.struct` of the reset's settings; `NoSettings` if it has none."""
+        """Warp struct type of the reset's settings; `NoSettings` if it has none."""
         return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
     def level_type(self) -> Any:
-        """The `@wp.struct` of a curriculum level; `NoSettings` if there are no levels."""
+        """Warp struct type of a curriculum level; `NoSettings` if there are no levels."""
         return self.levels[0].struct if self.levels else NoSettings
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
@@ -244,7 +244,7 @@ class TaskCfg(Copyable):
         return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in terms)})
 
     def without_noise(self) -> TaskCfg:
-        """Return the task with observation noise 0 in both groups; delays stay."""
+        """Return a copy of the task with observation noise 0 for actor and critic; delays stay."""
         exact = {g: tuple(term.replace(noise=0.0) for term in getattr(self.observations, g)) for g in self.groups}
         return replace(self, observations=ObservationsCfg(**exact))
 
@@ -261,17 +261,17 @@ class TaskCfg(Copyable):
 
     @property
     def termination_names(self) -> tuple[str, ...]:
-        """Names of the terminations, in the order in which they are checked."""
+        """Names of the task's termination terms, in the order in which they are checked."""
         return tuple(term.name for term in self.terminations)
 
     def on_level_ground(self) -> TaskCfg:
-        """Return the task whose resets sample no ground and whose terrain is a plane."""
+        """Return a copy of the task on a plane: without terrain, and without ground that resets sample."""
         if not hasattr(self.reset.settings, "on_level_ground"):
             return self
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))
 
     def nominal(self) -> TaskCfg:
-        """Return the task without randomisation and without events."""
+        """Return a copy of the task without randomisation and without events."""
         return replace(self, randomization=RandomizationCfg.off(), events=())
 
 

@@ -26,14 +26,14 @@ class CommandValue:
 
 @dataclass(frozen=True)
 class CommandLayout:
-    """Layout of a task's command: its one to four components, in order."""
+    """Layout of a task's command (such as a goal): its one to four components, in order."""
 
     values: tuple[CommandValue, ...]
     nonzero: bool = False  # Whether at least one number must differ from 0
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Allowed numbers of components of a command: with all, some or none of the optional ones."""
+        """Allowed lengths of a command: with all, some or none of its optional components."""
         required = sum(not value.optional for value in self.values)
         return tuple(range(required, len(self.values) + 1))
 

@@ -27,7 +27,7 @@ class Copyable:
     """
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of the constructor that make an equal object; by default the dataclass's fields."""
+        """Return the constructor's arguments that make an equal object; by default the dataclass's fields."""
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
         return {spec.name: getattr(self, spec.name) for spec in fields}
 
@@ -40,13 +40,13 @@ class Copyable:
                              for name, value in arguments})  # fmt: skip
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """Return the call that makes an equal object. Raises pickle.PicklingError: see `Reference.to`."""
+        """Return the constructor call that `pickle` stores. Raises pickle.PicklingError: see `Reference.to`."""
         arguments = self.arguments().items()
         return _make, (type(self), {k: Reference.to(value) if _is_named(value) else value for k, value in arguments})
 
 
 class Reference(NamedTuple):
-    """Name of a Warp function or struct in a pickle."""
+    """Module and name by which a pickle refers to a Warp function or struct."""
 
     module: str
     name: str
@@ -63,7 +63,7 @@ class Reference(NamedTuple):
         return cls(module_name, name, getattr(module, "__file__", None))
 
     def definition(self) -> Any:
-        """Return the function or struct, after importing its module. Raises ImportError or AttributeError: none."""
+        """Import the module, and return the named function or struct. Raises ImportError or AttributeError: none."""
         try:
             module = sys.modules.get(self.module) or importlib.import_module(self.module)
         except ModuleNotFoundError:
@@ -90,6 +90,6 @@ def _is_named(value: Any) -> bool:
 
 
 def _make(kind: type, arguments: dict[str, Any]) -> Any:
-    """Return an object of class `kind`; arguments: of its constructor, with references to functions and structs."""
+    """Return a new object of class `kind`; arguments: of its constructor, with references to functions and structs."""
     values = arguments.items()
     return kind(**{name: value.definition() if isinstance(value, Reference) else value for name, value in values})

@@ -20,14 +20,14 @@ SAME = {float: wp.float32, int: wp.int32, bool: wp.bool}  # Warp's types by Pyth
 
 
 def source_of(definition: Any) -> Any:
-    """Return the Python function or class of a Warp function or struct, or the class of an instance."""
+    """Return the Python function or class that defines a Warp function or struct, or the class of any other object."""
     if isinstance(definition, wp.Function):
         return definition.func
     return definition.cls if isinstance(definition, Struct) else type(definition)
 
 
 def place_of(definition: Any) -> str:
-    """Return file and line of a Warp function, a struct, or the class of an instance, as `my_task.py:12`."""
+    """Return file and line where a Warp function, a struct or an object's class is defined, as `my_task.py:12`."""
     source = source_of(definition)
     try:
         return f"{Path(inspect.getsourcefile(source) or '').name}:{inspect.getsourcelines(source)[1]}"
@@ -36,7 +36,7 @@ def place_of(definition: Any) -> str:
 
 
 def is_own(definition: Any) -> bool:
-    """Return whether a Warp function or struct, or the class of an instance, is defined outside the project."""
+    """Return whether a user defined a Warp function, a struct or an object's class, outside this project."""
     return not source_of(definition).__module__.startswith(PROJECT_PREFIX)
 
 
@@ -85,7 +85,7 @@ def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> N
 @functools.cache
 @locked
 def _returned(func: wp.Function, takes: tuple[Any, ...]) -> Any:
-    """Return the type that a function returns for arguments of types `takes`, None without a `return`."""
+    """Return the type that a Warp function returns for arguments of types `takes`, None without a `return`."""
     overload: Any = func.get_overload(list(takes), {})
     if overload is None:
         raise InputError(f"{place_of(func)}: {func.key} must take ({', '.join(map(shown_type, takes))})")
@@ -96,7 +96,7 @@ def _returned(func: wp.Function, takes: tuple[Any, ...]) -> Any:
 
 
 def check_values(where: str, settings: Any, *args: float) -> None:
-    """Raise InputError unless settings for kernels have a struct, of which `values(*args)` returns an instance."""
+    """Raise InputError unless settings have a Warp struct, `struct`, and `values(*args)` returns an instance of it."""
     struct, values = getattr(settings, "struct", None), getattr(settings, "values", None)
     if not isinstance(struct, Struct) or not callable(values):
         raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")

@@ -50,7 +50,10 @@ _SWAPPED: dict[Any, tuple[int, ...]] = {
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the mirror image of a task's observation; group: "actor" or "critic". Raises InputError: unknown term."""
+    """Return the left-right mirror image of a task's observation, as permutation and signs; group: "actor" or "critic".
+
+    Raises InputError: unknown term.
+    """
     order: list[int] = []
     signs: list[int] = []
     for term in getattr(task.observations, group):
@@ -69,5 +72,5 @@ def mirror_of(task: TaskCfg, group: str) -> Mirror:
 
 
 def mirror_of_action() -> Mirror:
-    """Return the mirror image of an action (12,), in motor order."""
+    """Return the left-right mirror image of an action (12,), in motor order, as permutation and signs."""
     return Mirror(np.array(MOTORS), np.ones(12, dtype=np.float32))

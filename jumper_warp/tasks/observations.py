@@ -44,7 +44,7 @@ def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[Obse
 
 
 def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
-    """Return the task whose actor terms in `REMEMBERED` have a history of `steps` policy steps; None: unchanged."""
+    """Return a task whose actor terms in `REMEMBERED` have a history of `steps` policy steps; None: unchanged."""
     if steps is None:
         return task
     return replace(task, observations=replace(task.observations, actor=remembered(task.observations.actor, steps)))

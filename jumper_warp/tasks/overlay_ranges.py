@@ -35,7 +35,7 @@ UNITS = {
 
 
 class RangeMoves(NamedTuple):
-    """Differences of an overlay's values from the described ones, in the units of `RandomizationCfg`."""
+    """Differences of a robot overlay's values from the robot description's, in the units of `RandomizationCfg`."""
 
     motor_friction: tuple[float, ...] = 12 * (0.0,)  # [N m]
     dynamic_friction: float = 0.0  # [1]
@@ -46,7 +46,7 @@ class RangeMoves(NamedTuple):
 
 
 def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
-    """Return the moves of the ranges for an overlay: 0 for quantities that it leaves out, or has ranges for."""
+    """Return how far an overlay moves randomisation ranges: 0 for quantities that it leaves out, or has ranges for."""
     if overlay is None:
         return RangeMoves()
     described, own, moves = vars(RobotValues.nominal(1)), overlay.randomization, {}
@@ -62,7 +62,7 @@ def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
 
 
 def with_own_ranges(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
-    """Return a copy of a task with an overlay's own ranges of randomisation in place of the task's.
+    """Return a copy of a task with a robot overlay's own ranges of randomisation in place of the task's.
 
     Raises InputError: a range is invalid, also where it is moved to the overlay's value.
     """
@@ -82,8 +82,9 @@ def with_own_ranges(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
 
 
 def ranges_of(task: TaskCfg, overlay: RobotOverlay | None) -> dict[str, Any]:
-    """Return the resulting ranges [lower, upper] by field of `RandomizationCfg`, in its units; off ones are left out.
+    """Return a task's randomisation ranges [lower, upper] on an overlay, by field and in units of `RandomizationCfg`.
 
+    Ranges that are off are left out.
     Motors with different friction have a list of 12 ranges. Errors: as `with_own_ranges`.
     """
     ranges, moves = with_own_ranges(task, overlay).randomization, moves_of(overlay)._asdict()
@@ -97,8 +98,9 @@ def ranges_of(task: TaskCfg, overlay: RobotOverlay | None) -> dict[str, Any]:
 
 
 def range_words(task: TaskCfg, overlay: RobotOverlay | None, *, changed: bool = False) -> list[str]:
-    """Return the resulting ranges as texts, such as "latency 5 to 21 ms"; over all motors where they differ.
+    """Return a task's randomisation ranges on an overlay as texts, such as "latency 5 to 21 ms".
 
+    Where motors differ, a text is over all of them.
     changed: only ranges that the overlay moves or replaces.
     """
     words, usual = [], ranges_of(task, None)
@@ -112,7 +114,7 @@ def range_words(task: TaskCfg, overlay: RobotOverlay | None, *, changed: bool = 
 def with_flagged_ranges(
     task: TaskCfg, flagged: TaskCfg, overlay: RobotOverlay, names: Collection[str]
 ) -> tuple[TaskCfg, RobotOverlay]:
-    """Return a task and an overlay in which the ranges that a user sets replace those of both.
+    """Return a task and a robot overlay in which randomisation ranges that a user sets replace those of both.
 
     flagged: the task with the user's ranges. names: of these ranges. An absolute range of the user is the overlay's
     own, so that it is not moved.
@@ -127,8 +129,9 @@ def with_flagged_ranges(
 def with_fixed_ranges(
     overlay: RobotOverlay | None, fixed: Mapping[str, tuple[float, float]], *, nominal: bool
 ) -> RobotOverlay | None:
-    """Return an overlay with given ranges besides its own; nominal: in place of them, with its friction of the paws.
+    """Return a robot overlay with given randomisation ranges besides its own.
 
+    nominal: in place of them, with its friction of the paws.
     fixed: (lower, upper) by field of `RandomizationCfg`.
     """
     if overlay is None:

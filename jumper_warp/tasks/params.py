@@ -59,7 +59,7 @@ class TaskParams:
                     self.values.append(float(value))
 
     def index(self, name: str) -> int:
-        """Return the index of a parameter by its dotted name. Raises InputError: there is none."""
+        """Return the index of a term's parameter by its dotted name. Raises InputError: there is none."""
         if name not in self.names:
             section, _, rest = name.partition(".")
             term, _, key = rest.rpartition(".")
@@ -69,10 +69,10 @@ class TaskParams:
 
 
 class ParamArrays:
-    """Device array of the parameters of a task's terms; captured graphs read changed values from it."""
+    """Device array of the parameters of a task's terms, which can change while captured CUDA graphs read it."""
 
     def __init__(self, params: TaskParams, device: Any) -> None:
-        """Copy the initial parameters to the device; params: names and values; device: Warp device."""
+        """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""
         self.params = params
         self.values = wp.array(params.values, dtype=float, device=device)
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
@@ -80,7 +80,10 @@ class ParamArrays:
 
     @locked
     def set(self, name: str, value: float) -> None:
-        """Change a parameter by its dotted name. Raises InputError: there is none, or it is not finite in float32."""
+        """Change a term's parameter, given by its dotted name, on the device.
+
+        Raises InputError: there is none, or it is not finite in float32.
+        """
         check_finite(name, value)
         i = self.params.index(name)
         for array in (self.values, self.changed):

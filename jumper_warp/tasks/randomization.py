@@ -31,7 +31,7 @@ def _base_mass() -> float:
 
 
 def _least(name: str) -> tuple[float, bool]:
-    """Return the smallest value that a range may contain, in its unit, and whether that value itself is excluded.
+    """Return the smallest value that a randomisation range may contain, in its unit, and whether it is itself excluded.
 
     name: the range's field in `RandomizationCfg`.
     """
@@ -136,12 +136,12 @@ class RandomizationCfg:
         return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
 
     def in_tests(self) -> RandomizationCfg:
-        """Return the ranges for evaluation: sampled at every reset, with pushes at intervals."""
+        """Return the randomisation ranges for evaluation: sampled at every reset, with pushes at intervals."""
         timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_probability": PUSH_PROBABILITY}
         return replace(self, resample_at="reset", **timing)
 
     def with_fixed(self, **values: Any) -> RandomizationCfg:
-        """Return a copy with fixed parameters; values: see `fixed_ranges`. Raises InputError: a value out of range."""
+        """Return a copy with constant parameters, see `fixed_ranges`. Raises InputError: a value out of range."""
         return replace(self, **fixed_ranges(**values))
 
     def events(self) -> tuple[EventTerm, ...]:
@@ -198,7 +198,7 @@ def fixed_ranges(
     *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None,
     sensor_offset: float | None = None,
 ) -> dict[str, tuple[float, float]]:  # fmt: skip
-    """Return ranges of fixed latency [ms], gains (factors on kp and kd [1]) or friction of the paws [1], by field.
+    """Return ranges that fix latency [ms], gains (factors on kp and kd [1]) or friction of the paws [1], by field.
 
     sensor_offset [deg]: largest error of a position sensor, sampled uniformly within plus and minus this per motor.
     """

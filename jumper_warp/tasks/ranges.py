@@ -15,7 +15,7 @@ Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
-    """Raise InputError if a dataclass has a number beyond MOST_SETTING or out of range, or a reversed pair.
+    """Raise InputError if a settings dataclass has a number beyond MOST_SETTING or out of range, or a reversed pair.
 
     prefix: before field names in messages. skip: fields to leave unchecked. not_negative: fields that must be >= 0.
     """
@@ -31,7 +31,7 @@ def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative
 
 
 def filled(struct: Any, cfg: Any, skip: Collection[str] = (), degrees: Collection[str] = ()) -> Any:
-    """Copy the fields of a dataclass to a kernel struct and return it; pairs become vec2.
+    """Copy the fields of a settings dataclass to a kernel struct, and return it; pairs (lower, upper) become vec2.
 
     skip: fields to omit; degrees: fields [deg] to convert to [rad].
     """

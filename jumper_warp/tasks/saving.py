@@ -33,14 +33,14 @@ MAX_ENTRIES = 1000  # of a list: a kernel of more terms would compile for a day
 
 
 class TaskError(InputError):
-    """A saved task that cannot be restored, or a task that cannot be saved. The message is one line."""
+    """Error: a saved task cannot be restored, or a task cannot be saved. The message is one line."""
 
 
 # ---------------------------------------------------------------------- to JSON
 
 
 def name_of(definition: Any) -> str:
-    """Return `module:name` of a Warp function, a struct or a class.
+    """Return the name `module:name` under which a Warp function, a struct or a class is saved.
 
     For a file that runs as a program, the module is the file's stem, under which `--task-module` loads it.
     Raises TaskError unless the definition is at the top level of its module.
@@ -54,7 +54,7 @@ def name_of(definition: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """Return a configuration as JSON data: dicts with "type", lists, scalars. Raises TaskError: it cannot be saved."""
+    """Return a part of a task as JSON data: dicts with "type", lists, scalars. Raises TaskError: it cannot be saved."""
     if isinstance(value, Term):
         options = {key: json_value(option) for key, option in value.options.items()}
         named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
@@ -79,7 +79,7 @@ def task_to_json(task: TaskCfg) -> dict[str, Any]:
 
 
 def handover_to_json(handover: Handover) -> dict[str, Any]:
-    """Return a handover as JSON data: names of its tasks and functions. Raises TaskError as `name_of`."""
+    """Return a handover of tasks as JSON data: names of its tasks and functions. Raises TaskError as `name_of`."""
     tasks = {"source": handover.source.name, "target": handover.target.name}
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
@@ -103,7 +103,7 @@ def project_modules() -> frozenset[str]:
 
 
 class Finder:
-    """Look-up of functions and types by `module:name`, in the project's modules and the user's."""
+    """Look-up of functions and types that a saved task names `module:name`, in the project's modules and the user's."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
         """Look names up in the project's modules, in `modules`, the user's loaded ones, and in their neighbours."""
@@ -132,7 +132,7 @@ class Finder:
 
 
 def check_version(saved: Any) -> None:
-    """Raise TaskError unless `saved` is a JSON object of the current VERSION."""
+    """Raise TaskError unless `saved` is a task's JSON object in the current version of the format, VERSION."""
     if not isinstance(saved, dict):
         raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
     if (version := saved.get("version")) != VERSION:
@@ -140,7 +140,7 @@ def check_version(saved: Any) -> None:
 
 
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
-    """Return the task that `task_to_json` saved; missing settings have their defaults.
+    """Restore a task from the JSON data of `task_to_json`; missing settings have their defaults.
 
     modules: the user's loaded modules. leave_out: sections in OPTIONAL to make empty, whose functions may be missing.
     Raises TaskError: it is no task of this version, or a function is in none of the modules.
@@ -209,7 +209,7 @@ def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
 
 
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
-    """Return the term or dataclass of a JSON object; its "type" (default: the hint) names a subclass of the hint."""
+    """Return the term or dataclass that a JSON object describes; its "type" (default: the hint) names a subclass."""
     base = object if hint is Any else hint
     kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
     if not (isinstance(kind, type) and isinstance(base, type) and issubclass(kind, base)):

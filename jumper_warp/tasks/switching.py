@@ -39,7 +39,7 @@ FALLS, FALLS_FROM_FLIGHT = (
 def for_switching(
     task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
 ) -> TaskCfg:
-    """Return a task for a robot that switches between skills: on level ground, ended by falls alone.
+    """Return a copy of a task for a robot that switches between skills: on level ground, ended by falls alone.
 
     It has no rewards, critic, events and metrics. randomization: ranges for the robot, the same in all its skills.
     """

@@ -103,12 +103,12 @@ class Term(Copyable):
             raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
 
     def _leading(self) -> tuple[Any, ...]:
-        """Return the entry of `takes` that fits the first argument of the term's function; empty: none does."""
+        """Return the types of the leading arguments, from `takes`, that fit the term's function; empty: none do."""
         first = next(iter(self.func.input_types.values()), None)
         return next((kinds for kinds in self.takes if first in (Any, kinds[0])), ())
 
     def _may_return(self, kind: Any, state: Any = Any) -> bool:
-        """Return whether the function of a term of a task with this `state` may return values of a type."""
+        """Return whether the term's function may return values of type `kind` in a task with this `state`."""
         return not self.returns or kind in self.returns
 
     @property
@@ -142,7 +142,7 @@ class Term(Copyable):
         return flat
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of the constructor that make an equal term."""
+        """Return the constructor's arguments that make an equal term."""
         return {"func": self.func, "name": self.name, **self.numbers, **self.options}
 
     def __eq__(self, other: object) -> bool:
@@ -216,7 +216,7 @@ class ObservationTerm(Term):
                 raise InputError(f"ObservationTerm {self.name}: {key} must be in {limits}")
 
     def _may_return(self, kind: Any, state: Any = Any) -> bool:
-        """Return whether the function may return values of a type: a number or a vector."""
+        """Return whether the term's function may return values of type `kind`: a number or a vector."""
         vector = hasattr(kind, "_length_") and getattr(kind, "_wp_scalar_type_", None) is wp.float32
         return kind in (float, wp.float32) or vector
 
@@ -275,13 +275,13 @@ class EventTerm(Term):
 
 
 class Advance(Term):
-    """Update of a task's state by a policy step, such as the phases of a jump.
+    """Term that updates a task's state in each policy step, such as the phase of a jump.
 
     Function: (robot: RobotView, state, ...) -> state.
     """
 
     def _may_return(self, kind: Any, state: Any = Any) -> bool:
-        """Return whether the function may return values of a type: the state, or if it is unknown a `@wp.struct`."""
+        """Return whether the function may return type `kind`: the state or, if that is unknown, a `@wp.struct`."""
         return kind in (Any, state) or (state is Any and hasattr(kind, "vars"))
 
     @property

@@ -15,7 +15,7 @@ from jumper_warp.rl.ppo import Ppo
 
 
 def make_ppo(env: VecEnv, cfg: PpoCfg) -> Ppo:
-    """Return PPO on an environment, with the fused kernels if the device can use them and `PpoCfg.fused` is set.
+    """Return the PPO trainer of an environment, with fused kernels if the device has them and `PpoCfg.fused` is set.
 
     Raises InputError as `Ppo`.
     """

@@ -18,7 +18,7 @@ ROWS = 64  # Number of samples in a block of the kernels of this module
 
 
 class FusedRollout(NamedTuple):
-    """Transitions of all worlds over num_steps policy steps; features are normalised and zero-padded observations."""
+    """Transitions of all worlds over num_steps policy steps, with normalised, zero-padded observations (features)."""
 
     features: torch.Tensor  # (num_steps, num_envs, padded num_obs)
     critic_features: torch.Tensor  # (num_steps + 1, num_envs, padded num_critic_obs)
@@ -32,10 +32,10 @@ class FusedRollout(NamedTuple):
 
 
 class ObservationWriter:
-    """Writer of features: sanitises and normalises observations, and sums them for the moments of a rollout."""
+    """Writer that normalises observations, stores them as inputs of a network, and sums them for their moments."""
 
     def __init__(self, running: RunningMoments, features: torch.Tensor, num_steps: int) -> None:
-        """Allocate sums for num_steps steps; running: statistics that normalise; features: (…, num_envs, width)."""
+        """Allocate sums of observations; running: statistics that normalise; features: (…, num_envs, width)."""
         num_obs, (worlds, width) = len(running.mean), features.shape[-2:]
         self._running, self._grid = running, (blocks(worlds, ROWS), blocks(width, 64))
         self._scaling = Scaling(*(x.to(features.device) for x in (torch.zeros(num_obs), torch.ones(num_obs))))
@@ -43,12 +43,12 @@ class ObservationWriter:
         self._num_obs, self._samples = num_obs, num_steps * worlds
 
     def begin(self) -> None:
-        """Adopt the current running statistics."""
+        """Copy the running mean and standard deviation that normalise all observations of the next rollout."""
         for scaling, value in zip(self._scaling, self._running.scaling(), strict=True):
             scaling.copy_(value)
 
     def write(self, obs: torch.Tensor, features: torch.Tensor, step: int = -1) -> None:
-        """Write raw observations (num_envs, num_obs) as features (num_envs, width).
+        """Normalise raw observations (num_envs, num_obs), and write them to `features` (num_envs, width).
 
         step: whose moments they count for (default: none).
         """
@@ -58,16 +58,16 @@ class ObservationWriter:
         )  # fmt: skip
 
     def moments(self) -> Moments:
-        """Return the moments of the observations of all steps, float64."""
+        """Return mean, variance and count of the observations in all steps of the rollout, float64."""
         sums = self._sums[:-1].sum((0, 1), dtype=torch.float64)[:, : self._num_obs] / self._samples
         return Moments(self._scaling.mean + sums[0], (sums[1] - sums[0].square()).clamp(min=0.0), self._samples)
 
 
 class FusedCollector:
-    """Collector of rollouts, with the interface of `Collector`; the kernels of the update act."""
+    """Collector of rollouts that samples actions with the fused kernels; it has the interface of `Collector`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, fused: FusedModel) -> None:
-        """Allocate the rollout; flat, fused: parameters and networks of `model`."""
+        """Allocate the memory of a rollout; flat, fused: parameters and networks of `model`."""
         self.env, self.cfg, self._fused, self._actor = env, cfg, fused, flat.actor
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
@@ -91,7 +91,7 @@ class FusedCollector:
 
     @torch.no_grad()
     def roll(self) -> None:
-        """Fill the rollout by acting for `num_steps` policy steps."""
+        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout."""
         self.obs.begin()
         self.critic_obs.begin()
         self._fused.copy_weights()
@@ -115,7 +115,7 @@ class FusedCollector:
         )  # fmt: skip
 
     def record(self, step: int) -> None:
-        """Write the result of the environment's last step to the rollout, and count episodes."""
+        """Write the environment's last reward, end and final observation to the rollout, and count episodes."""
         env, rollout, worlds = self.env, self.rollout, self.env.num_envs
         self.critic_obs.write(self._final_critic_obs, rollout.final_features[step])
         launch(kernels.record_step, (blocks(worlds, ROWS),))(

@@ -25,7 +25,7 @@ Launch = Callable[..., Any]  # A kernel with its grid
 
 
 class Layer(NamedTuple):
-    """Location of a layer in the vector of `FusedLayout`, and its padded widths."""
+    """Location of a layer's weight and bias in the kernels' padded parameter vector, and the layer's padded widths."""
 
     weight: int  # first entry of the weight (outputs, inputs)
     bias: int  # first entry of the bias (outputs,)
@@ -35,14 +35,14 @@ class Layer(NamedTuple):
 
 
 class FusedLayout:
-    """Layout of the padded copy of the parameters, and of the partial sums of their gradients.
+    """Places of all parameters in the kernels' zero-padded vector of parameters, and in the sums of their gradients.
 
     `table` (3, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in the
     padded vector, the place of its mirror image, and the image's sign; 0 is a place that nothing uses.
     """
 
     def __init__(self, flat: FlatParameters, symmetry: Symmetry | None) -> None:
-        """Lay out actor, noise, critic and losses; symmetry: of the actor, if it is mirror-symmetric."""
+        """Assign places to actor, noise, critic and losses; symmetry: the actor's, if it is mirror-symmetric."""
         self.size = WIDTH
         self._flat, self._table = flat, torch.zeros(3, flat.all_reduced.numel(), dtype=torch.int64)
         count = 2 * len(flat.actor.layers.weights)
@@ -55,14 +55,14 @@ class FusedLayout:
         self.table = self._table.to(flat.value.device, torch.int32)
 
     def _place(self, index: torch.Tensor) -> int:
-        """Place a vector, given by the indices of its entries in the flat vector; return its first entry's place."""
+        """Assign places in the padded vector to the entries `index` of the flat vector; return the first place."""
         start = self.size
         self._table[0, index] = start + torch.arange(len(index))
         self.size += aligned(len(index), WIDTH)
         return start
 
     def _network(self, segments: list[Segment], obs: MirrorMap | None) -> list[Layer]:
-        """Place a network's layers; obs: mirror map of the observation, which doubles the first layer."""
+        """Assign places to a network's layers; obs: the observation's mirror map, which doubles the first layer."""
         layers = []
         for weight, bias in zip(segments[::2], segments[1::2], strict=True):
             (num_out, num_in), first = weight.shape, not layers
@@ -86,14 +86,14 @@ class FusedLayout:
         return layers
 
     def copy_weights(self, weights: torch.Tensor) -> None:
-        """Copy the parameters to the padded vector (size,)."""
+        """Copy the parameters from the flat vector to the kernels' padded vector (size,)."""
         value, (place, image, sign) = self._flat.value, self.table[:, : self._flat.size].to(torch.int64)
         weights[image] = (sign * value).to(weights.dtype)
         weights[place] = value.to(weights.dtype)
 
 
 class FusedModel:
-    """Actor and critic of an `ActorCritic` for the fused kernels, with the copy of its weights."""
+    """Actor and critic for the fused kernels, with a padded copy of the weights of an `ActorCritic`."""
 
     def __init__(self, model: ActorCritic, flat: FlatParameters, rows: int, dtype: torch.dtype) -> None:
         """Allocate networks for at most `rows` samples; dtype: of weights, activations and their gradients."""
@@ -112,7 +112,7 @@ class FusedModel:
             self.mirror[:, : len(symmetry.action.order)] = torch.stack([*symmetry.action])
 
     def copy_weights(self) -> None:
-        """Copy the parameters to the kernels' weights."""
+        """Copy the current parameters of actor and critic to the padded vector that the kernels read."""
         self.layout.copy_weights(self.weights)
 
 
@@ -149,12 +149,13 @@ class FusedNetwork:
 
     @property
     def width(self) -> int:
-        """Padded width of the output."""
+        """Number of columns of the network's output, padding included."""
         return self._layers[-1].outputs
 
     def forward(self, x: torch.Tensor, rows: int, index: torch.Tensor | None = None) -> torch.Tensor:
-        """Write `output` for normalised observations, and return it; with an index also what `backward` needs.
+        """Evaluate the network on normalised observations, write `output` and return it.
 
+        With an index also write what `backward` needs.
         x: (…, padded width of the observation), the rows `index` of it if given, else the first `rows`.
         """
         gather, block = index is not None, 32 if self._layers[0].inputs % 64 else 64
@@ -175,7 +176,7 @@ class FusedNetwork:
         return self.output
 
     def backward(self, x: torch.Tensor, rows: int, index: torch.Tensor) -> None:
-        """Write the partial sums of all parameters' gradients for `grad_output`; arguments: as in `forward`."""
+        """Backpropagate `grad_output`; write all parameters' gradients as partial sums; arguments: as in `forward`."""
         count, gradients, outputs = self._rows_per_sample * rows, tuple(self._gradients), tuple(self._outputs)
         if self._whole:
             launch(kernels.network_backward, (blocks(count, 64),))(
@@ -196,7 +197,7 @@ class FusedNetwork:
 
 
 def blocks(count: int, size: int) -> int:
-    """Return the number of blocks of a size that `count` entries need."""
+    """Return the number of blocks of `size` entries that `count` entries need."""
     return -(-count // size)
 
 
@@ -206,7 +207,7 @@ def power_of_two(width: int) -> int:
 
 
 def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]:
-    """Return the tiles of the weights' gradients: of each layer its first, the next layer's first, BM and BN."""
+    """Return how each layer's weight gradient is divided into tiles: first tile, next layer's first tile, BM and BN."""
     tiles, count = [], 0
     for layer in layers:
         bm, bn = (min(power_of_two(width), 128) for width in (layer.outputs, layer.inputs))
@@ -216,10 +217,10 @@ def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]
 
 
 def rows_per_split(rows: int) -> int:
-    """Return the number of rows of each of the SPLITS splits, the last ones may have fewer."""
+    """Return the number of samples in each of the SPLITS parts (the last ones may have fewer) of a gradient's sum."""
     return aligned(blocks(rows, SPLITS), WIDTH)
 
 
 def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 3) -> Launch:
-    """Return a function that launches a kernel on a grid with its positional arguments."""
+    """Return a function that launches a Triton kernel on a grid; its arguments are the kernel's."""
     return lambda *args: kernel[grid](*args, num_warps=num_warps, num_stages=num_stages)

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class FusedPpo(Ppo):
-    """`Ppo` that acts and updates with the fused kernels; it has no `packer`, and its rollout is a `FusedRollout`."""
+    """PPO trainer that acts and updates with fused kernels; it has no `packer`, and its rollout is a `FusedRollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
-        """Build networks and buffers as `Ppo`, with the same weights for a seed. Raises InputError as `Ppo`."""
+        """Build networks and buffers as `Ppo` does, with the same weights for a seed. Raises InputError as `Ppo`."""
         super().__init__(env, cfg)
         del self.collector, self.rollout, self.packer, self._minibatch, self._roll, self._batch, self._optimise
         model, cuda = self.model, env.device.type == "cuda"
@@ -59,7 +59,7 @@ class FusedPpo(Ppo):
 
     @torch.no_grad()
     def batch(self) -> Batch:
-        """Return the rollout's samples, time-major, as views of memory, and update the running statistics.
+        """Compute the rollout's training samples, return views of them, time-major, and update the running moments.
 
         Also samples the order of the samples in every epoch.
         """
@@ -67,7 +67,7 @@ class FusedPpo(Ppo):
         return self.fused.batch()
 
     def _sample_orders(self) -> None:
-        """Sample the order of the samples in every epoch."""
+        """Sample the random order of the training samples in every epoch."""
         for order in self._orders:
             order.copy_(self.order())
 

@@ -23,13 +23,13 @@ LOSS_ROWS = 256  # Samples that a block of the losses' kernels handles at a time
 
 
 class FusedUpdate:
-    """Optimiser steps on the rollout of a `FusedCollector`, with the kernels' own gradients."""
+    """PPO's update of actor and critic on the rollout of a `FusedCollector`, with gradients by fused kernels."""
 
     def __init__(
         self, collector: FusedCollector, cfg: PpoCfg, model: ActorCritic, optimiser: FlatAdam, fused: FusedModel,
         coefficients: tuple[torch.Tensor, torch.Tensor], sums: torch.Tensor, obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
-        """Allocate memory for returns; fused: networks of `model`, with the rows of a minibatch at least.
+        """Allocate the memory of the update; fused: networks of `model`, with the rows of a minibatch at least.
 
         coefficients: desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`;
         obs_mirror: map that symmetrises observation statistics.
@@ -54,7 +54,7 @@ class FusedUpdate:
 
     @torch.no_grad()
     def pack(self) -> None:
-        """Fill the batch with values, advantages and returns of the rollout, and update the value statistics."""
+        """Compute values, advantages and returns, store them with the rollout's samples, and update running moments."""
         rollout, model, cfg = self._collector.rollout, self._model, self._cfg
         (steps, worlds), actions = rollout.reward.shape, rollout.action.shape[2]
         for start in range(0, len(self._head), self._rows):
@@ -72,7 +72,7 @@ class FusedUpdate:
         self._samples[:, 2 * actions + 1 : 2 * actions + 4] = torch.stack(columns, dim=1)
 
     def _update_statistics(self, advantage: Moments, target: Moments) -> Scaling:
-        """Update the running statistics as `BatchPacker.pack`, and return the normalisation of advantages, () each."""
+        """Update the moments of observations and returns; return the normalisation of advantages, () each."""
         model, collector = self._model, self._collector
         local = RolloutMoments(advantage, target, collector.obs.moments(), collector.critic_obs.moments())
         moments = RolloutMoments(*all_reduce_moments(local))
@@ -88,7 +88,7 @@ class FusedUpdate:
         return Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
 
     def batch(self) -> Batch:
-        """Return the samples, time-major, as views; features in the type of the products."""
+        """Return the rollout's samples, time-major, as views; observations have the type of matrix products."""
         collector, actions = self._collector, self._collector.rollout.action.shape[2]
         action, mean, *scalars = self._samples[:, : 2 * actions + 4].split((actions, actions, 1, 1, 1, 1), dim=1)
         sizes = collector.env.num_obs, len(self._model.critic_moments.mean)
@@ -96,7 +96,7 @@ class FusedUpdate:
         return Batch(*features, action, mean, *(each[:, 0] for each in scalars))
 
     def step(self, samples: torch.Tensor) -> None:
-        """Run one optimiser step on samples, given by their indices (batch,); averages gradients over all ranks."""
+        """Run one optimiser step on samples, given by their indices (batch,), with the mean gradient of all ranks."""
         if world_size() == 1:
             self.compute_gradient(samples)
             self.update_parameters()
@@ -121,7 +121,7 @@ class FusedUpdate:
         stream.wait_stream(self._side_stream)
 
     def compute_gradient(self, samples: torch.Tensor) -> None:
-        """Write gradient and losses of a minibatch to `FlatParameters.all_reduced`; samples: indices (batch,)."""
+        """Write losses and gradient of a minibatch to `FlatParameters.all_reduced`; samples: indices (batch,)."""
         self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
         partial, layout, gradient = self._fused.partial, self._fused.layout, self._flat.all_reduced
         launch(kernels.sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
@@ -129,7 +129,7 @@ class FusedUpdate:
         )
 
     def _actor_gradient(self, samples: torch.Tensor) -> None:
-        """Write the partial sums of the gradients of actor and noise, and of the actor's losses."""
+        """Compute PPO's gradients of actor and noise; write them and the actor's losses as partial sums."""
         fused, flat, rows = self._fused, self._flat, len(samples)
         partial, layout, log_std = fused.partial, fused.layout, flat.actor.log_std
         output = fused.actor.forward(self._features, rows, samples)
@@ -142,7 +142,7 @@ class FusedUpdate:
         fused.actor.backward(self._features, rows, samples)
 
     def _critic_gradient(self, samples: torch.Tensor) -> None:
-        """Write the partial sums of the critic's gradient and loss."""
+        """Compute the critic's gradient of the value loss; write it and the loss as partial sums."""
         fused, cfg, rows = self._fused, self._cfg, len(samples)
         partial, critic = fused.partial, fused.critic
         output = critic.forward(self._critic_features, rows, samples)

@@ -16,7 +16,7 @@ from jumper_warp.utils.errors import InputError
 
 @dataclass(frozen=True)
 class TurnCfg:
-    """Range of sampled turns: one level of the curriculum."""
+    """Range of commanded turns that resets sample: one level of the curriculum."""
 
     angle: Pair
     """[deg] Angle of a commanded turn."""

@@ -66,7 +66,7 @@ class GroundCfg:
 
 @dataclass(frozen=True)
 class Level:
-    """Ranges of goals and standing starts: one level of the curriculum."""
+    """Level of a jump curriculum: ranges of sampled goals and of the base height in standing starts."""
 
     goal_lower: tuple[float, float, float]
     """[m] Smallest goal: landing x, y relative to start and heading, and base height at the apex (0: any)."""
@@ -96,7 +96,7 @@ class Level:
 
 
 def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
-    """Return a curriculum of each level of goals with each range of base heights [m] at the start, easiest first.
+    """Return a curriculum that combines each level of goals with each range of initial base heights [m], easiest first.
 
     It has len(goals) * len(starts) levels. The curriculum of starts restarts with every level of goals, as in the
     authors' training.
@@ -124,7 +124,7 @@ class StartProbability:
 
 @dataclass(frozen=True)
 class ResetCfg:
-    """Reference state initialisation: probabilities of start modes, and ranges of their states; angles in degrees."""
+    """Start of episodes (reference state initialisation): start modes and ranges of their states; angles in degrees."""
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"

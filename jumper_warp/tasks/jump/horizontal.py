@@ -96,7 +96,7 @@ def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_
 
 
 def level_all_around(ahead: float, aside: float, back: float) -> Level:
-    """Return a curriculum level with goals in an ellipse.
+    """Return a curriculum level with goals in an ellipse around the start.
 
     Arguments: its half axes [m] ahead, to either side and back.
     """
@@ -140,14 +140,14 @@ def horizontal_jump() -> TaskCfg:
 
 
 def horizontal_jump_slippery() -> TaskCfg:
-    """Return the horizontal jump with paw friction randomised from 0.35 up to the paper's range."""
+    """Return the task of a horizontal jump with paw friction randomised from 0.35 up to the paper's range."""
     task = horizontal_jump()
     slippery = replace(task.randomization, static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
     return replace(task, name="horizontal-jump-slippery", randomization=slippery)
 
 
 def horizontal_jump_sighted() -> TaskCfg:
-    """Return the horizontal jump with the edges and height of the block ahead in the policy's observation."""
+    """Return the task of a horizontal jump in which the policy observes edges and height of the block ahead."""
     task, ground = horizontal_jump(), replace(RESET.ground, platform=0.30, block=0.45)
     return replace(
         task,
@@ -158,7 +158,7 @@ def horizontal_jump_sighted() -> TaskCfg:
 
 
 def omnidirectional_jump() -> TaskCfg:
-    """Return the horizontal jump with goals in all directions: other levels and starts, half the symmetry reward."""
+    """Return the task of a horizontal jump in all directions: other levels and starts, half the symmetry reward."""
     task = horizontal_jump()
     settings = replace(
         RESET, forward_pitch=0.0, takeoff_pitch=(0.0, 0.0), takeoff_ahead=(0.0, 0.2), touchdown_behind=(0.05, 0.12)

@@ -26,13 +26,13 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return the motors of jumps on Mars: transversal kp KP, limit TORQUE; lateral_torque: lateral limit [N m]."""
+    """Return motor settings of jumps on Mars: transversal kp KP, limit TORQUE; lateral_torque: lateral limit [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 
 
 def vertical_jump_mars() -> TaskCfg:
-    """Return the vertical jump on Mars with the command filter of the vertical jump on Earth."""
+    """Return the task of a vertical jump on Mars with the command filter of the vertical jump on Earth."""
     task = vertical_jump()
     task = replace(
         task,
@@ -65,7 +65,7 @@ def vertical_jump_mars() -> TaskCfg:
 
 
 def vertical_jump_mars_loose() -> TaskCfg:
-    """Return the vertical jump on Mars with the loose command filter and goals up to 3.6 m."""
+    """Return the task of a vertical jump on Mars with the loose command filter and goals up to 3.6 m."""
     return replace(
         vertical_jump_mars(),
         name="vertical-jump-mars-loose",
@@ -75,7 +75,7 @@ def vertical_jump_mars_loose() -> TaskCfg:
 
 
 def horizontal_jump_mars() -> TaskCfg:
-    """Return the horizontal jump on Mars, on level ground, with the command filter of the horizontal jump on Earth."""
+    """Return the task of a horizontal jump on Mars, on level ground, with the command filter of the jump on Earth."""
     task = horizontal_jump()
     settings = replace(task.reset.settings, highest_apex=2.5, takeoff_angle=(35.0, 70.0), ground=GroundCfg())
     task = replace(
@@ -103,5 +103,5 @@ def horizontal_jump_mars() -> TaskCfg:
 
 
 def horizontal_jump_mars_loose() -> TaskCfg:
-    """Return the horizontal jump on Mars with the loose command filter."""
+    """Return the task of a horizontal jump on Mars with the loose command filter."""
     return replace(horizontal_jump_mars(), name="horizontal-jump-mars-loose", command_filter=loose_filter())

@@ -209,7 +209,7 @@ TRANSVERSAL = LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0)  # A
 
 
 def vertical_jump_paper() -> TaskCfg:
-    """Return the paper's vertical jump."""
+    """Return the task of the vertical jump as printed in the paper."""
     return TaskCfg(
         name="vertical-jump-paper",
         state=JumpState,
@@ -231,7 +231,7 @@ def vertical_jump_paper() -> TaskCfg:
 
 
 def horizontal_jump_paper() -> TaskCfg:
-    """Return the paper's horizontal jump."""
+    """Return the task of the horizontal jump as printed in the paper."""
     return TaskCfg(
         name="horizontal-jump-paper",
         state=JumpState,

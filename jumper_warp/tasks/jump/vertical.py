@@ -79,12 +79,12 @@ RESET = ResetCfg(
 
 
 def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
-    """Return the curriculum for pairs (lowest, highest) of apex heights of the base [m], each with all `STARTS`."""
+    """Return a curriculum of ranges (lowest, highest) of apex heights of the base [m], each with all `STARTS`."""
     return cross_levels([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
 
 
 def vertical_jump() -> TaskCfg:
-    """Return the vertical jump with torque limits of 18 N m and, for lateral motors, the authors' 10 N m."""
+    """Return the task of a vertical jump with torque limits of 18 N m and, for lateral motors, the authors' 10 N m."""
     return TaskCfg(
         name="vertical-jump",
         state=JumpState,

@@ -97,7 +97,7 @@ METRICS = (
 
 
 def velocity_flat() -> TaskCfg:
-    """Return velocity tracking on a plane, with the gains and the 10 N m torque limit of the authors' code."""
+    """Return the task of velocity tracking on a plane, with gains and 10 N m torque limit of the authors' code."""
     return TaskCfg(
         name="velocity-flat",
         state=VelocityState,
@@ -121,7 +121,7 @@ def velocity_flat() -> TaskCfg:
 
 
 def velocity_trot() -> TaskCfg:
-    """Return velocity tracking on a plane with an observed 2 Hz gait clock and a reward for trotting in phase."""
+    """Return the task of velocity tracking on a plane with an observed 2 Hz gait clock and a reward for trotting."""
     flat = velocity_flat()
     gait_phase = ObservationTerm(velocity.gait_phase)
     return replace(

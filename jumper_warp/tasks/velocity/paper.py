@@ -104,7 +104,7 @@ RANDOMIZATION = RandomizationCfg(
 
 
 def velocity_paper() -> TaskCfg:
-    """Return the paper's velocity tracking."""
+    """Return the task of velocity tracking as printed in the paper."""
     return TaskCfg(
         name="velocity-paper",
         state=VelocityState,

@@ -32,7 +32,7 @@ STEPS_UP = (
 
 
 def velocity_rough() -> TaskCfg:
-    """Return velocity tracking on a terrain map with the kinds `GROUNDS`."""
+    """Return the task of velocity tracking on a terrain map with the kinds of ground in `GROUNDS`."""
     flat = velocity_flat()
     task = replace(
         flat,

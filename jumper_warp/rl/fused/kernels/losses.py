@@ -8,7 +8,7 @@ from jumper_warp.rl.fused.kernels.scalar import HALF_LOG_TAU
 
 @triton.jit
 def policy_mean(output, mirror, row, action, mask, width, MIRROR: tl.constexpr):
-    """Return the policy's mean action and f(x) - N f(M x) for rows of the network's output; (len(row), len(action)).
+    """Return the policy's mean action and asymmetry f(x) - N f(M x), (len(row), len(action)), from network outputs.
 
     MIRROR: rows 2 i and 2 i + 1 of `output` are f(x) and f(M x) of row i; mirror: (2, width) order and signs of N.
     """
@@ -29,8 +29,9 @@ def actor_loss(
     loss_partial, stride, rows, rows_per_split, num_actions, clip, MIRROR: tl.constexpr, WIDTH: tl.constexpr,
     BM: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradients of `ppo.actor_gradient`'s loss with respect to output and noise, and the losses.
+    """Write PPO's actor losses, and their gradients with respect to the network's output and the exploration noise.
 
+    Formulas: see `ppo.actor_gradient`.
     output, grad_output: (rows, WIDTH), twice the rows with MIRROR, as in `policy_mean`. samples: (…, sample_width), of
     which the rows `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, asymmetry,
     KL, sums over each split as in `weight_gradient`.
@@ -92,8 +93,9 @@ def critic_loss(
     output, samples, sample_width, index, grad_output, loss_partial, stride, rows, rows_per_split, num_actions, clip,
     weight, CLIP_VALUE: tl.constexpr, WIDTH: tl.constexpr, BM: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradient of `ppo.critic_gradient`'s loss with respect to the output, and the value loss.
+    """Write PPO's value loss, and its gradient with respect to the critic's output.
 
+    Formulas: see `ppo.critic_gradient`.
     output, grad_output: (rows, WIDTH), of which column 0 counts; samples, index, loss_partial: as in `actor_loss`.
     """
     split, col = tl.program_id(0), tl.arange(0, WIDTH)

@@ -11,8 +11,9 @@ LOG_BETA_2 = tl.constexpr(-0.0010005003335835335)
 
 @triton.jit
 def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr):
-    """Write the flat gradient (total,), the sums of the splits in `partial` (SPLITS, stride), always in one order.
+    """Sum gradients over the splits of the samples, in a fixed order, and write the flat gradient (total,).
 
+    partial: (SPLITS, stride), the gradient of each split.
     table: (3, total) of `FusedLayout`, the entry that a parameter has in `partial`, that of its mirror image, the sign.
     """
     i = tl.program_id(0) * B + tl.arange(0, B)
@@ -34,8 +35,9 @@ def prepare_step(
     gradient, squares, lr, num_steps, factors, desired_kl, size, actor_size, min_lr, max_lr, ADAPT: tl.constexpr,
     B: tl.constexpr,
 ):  # fmt: skip
-    """Write sums of squares of the gradient by block, (blocks, 2) of actor and critic, and the step's learning rate.
+    """Adapt the learning rate for a step of Adam, and write sums of squares of the gradient by block, (blocks, 2).
 
+    The two columns are actor and critic.
     gradient: (size + 32,), the last entry is the KL divergence. lr, num_steps: () of `FlatAdam`; the rate adapts as in
     `flat.adapted_lr`. factors: (2,) Adam's factors of both moments in this step.
     """
@@ -63,7 +65,7 @@ def adam_step(
     value, gradient, exp_avg, exp_avg_sq, squares, factors, weights, table, sums, size, actor_size, max_norm,
     BLOCKS: tl.constexpr, NUM_SQUARES: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Clip the gradient, update parameters and moments by a step of Adam, and add the statistics to `sums`.
+    """Clip the gradient, update parameters and moments by a step of Adam, and add losses and gradient norms to `sums`.
 
     gradient: (size + 32,), then surrogate, value loss, entropy, asymmetry, and the KL divergence as the last entry.
     squares (NUM_SQUARES, 2), factors (2,): of `prepare_step`; BLOCKS: power of two, at least NUM_SQUARES. weights: the

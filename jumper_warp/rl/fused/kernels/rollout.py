@@ -12,7 +12,7 @@ def observe(
     obs, row_stride, col_stride, mean, std, features, moments, rows, num_obs, width, raw_limit, limit,
     BM: tl.constexpr, BN: tl.constexpr,
 ):  # fmt: skip
-    """Write normalised, zero-padded observations, (rows, width), and sums over blocks of rows for their moments.
+    """Write normalised, zero-padded observations, (rows, width), and the sums that their mean and variance need.
 
     obs: (rows, num_obs) raw, sanitised as `vec_env.sanitise`; mean, std: (num_obs,). moments: (blocks, 2, width) sums
     of the difference from `mean`, and of its square.
@@ -38,7 +38,7 @@ def sample_action(
     output, mirror, log_std, action, samples, rows, num_actions, sample_width, MIRROR: tl.constexpr,
     WIDTH: tl.constexpr, BM: tl.constexpr,
 ):  # fmt: skip
-    """Write the sampled action, and action, mean and log probability to the samples of one step, (rows, sample_width).
+    """Sample actions; write them to `action`, and with mean and log probability to `samples` (rows, sample_width).
 
     output, mirror: as in `policy_mean`; action: (rows, num_actions), standard normal noise on entry.
     """
@@ -61,7 +61,7 @@ def sample_action(
 def record_step(
     reward, done, timeout, rewards, dones, timeouts, episode, finished, rows, scale, B: tl.constexpr
 ):  # fmt: skip
-    """Write a step's reward, done and timeout, (rows,) each, to the rollout, and update the counts of episodes.
+    """Write a step's reward, done and timeout, (rows,) each, to the rollout; update returns and lengths of episodes.
 
     episode: (2, rows) and finished: (3, rows), float64, as in `Collector`.
     """
