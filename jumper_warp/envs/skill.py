@@ -173,7 +173,7 @@ class TaskRuntime:
 
     @locked
     def metrics(self) -> dict[str, float]:
-        """Return metrics by name since the last call, and clear the counters (waits for the device).
+        """Return the task's metrics by name since the last call, and clear the counters (waits for the device).
 
         A mean without samples is 0. `Episode_Reward/<term>`: mean over the ended episodes of the term's sum over the
         episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean sum, of a task without a time limit.

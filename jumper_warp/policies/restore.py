@@ -34,7 +34,7 @@ def task_of_policy(
 def restored_task(
     config: dict[str, Any], modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return the task in the entry `env.task` of a saved configuration.
+    """Restore the task in a saved configuration of a policy or a training run, from its entry `env.task`.
 
     config: configuration of a policy or a run. modules: user modules in which functions from outside the project are
     looked up. leave_out: sections to leave empty (default: the sections that only a training needs).

@@ -62,7 +62,7 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
 
 
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
-    """Return a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
+    """Load a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
 
     A task's log folder, `logs/TASK`, stands for its newest run with a checkpoint.
     newest: whether to use the newest checkpoint of a run, not the best; of rsl-rl's runs it is always the newest.

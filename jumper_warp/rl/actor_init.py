@@ -32,7 +32,7 @@ def make_actor_init(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
     symmetry: Symmetry | None = None,
 ) -> ActorInit:  # fmt: skip
-    """Return the initialisation that makes the actor of a training with settings `cfg` equal to a given policy.
+    """Return initial weights and statistics that make a training's actor, with settings `cfg`, equal to a policy.
 
     With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric policy; any other
     becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.

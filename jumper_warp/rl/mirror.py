@@ -31,7 +31,7 @@ class MirrorMap(NamedTuple):
     signs: torch.Tensor  # (n,) float32, 1 or -1
 
     def apply(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the mirror image of x (..., n)."""
+        """Return the left-right mirror image of x (..., n)."""
         return self.signs * x[..., self.order]
 
     def symmetrise_moments(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -49,7 +49,7 @@ class MirrorMap(NamedTuple):
         return MirrorMap(torch.cat([self.order, padding]), signs)
 
     def matrix(self) -> torch.Tensor:
-        """Return the mirror map as a matrix (n, n)."""
+        """Return the mirror map as a matrix (n, n), whose product with x is the mirror image."""
         return self.signs[:, None] * torch.eye(len(self.order), device=self.signs.device)[self.order]
 
 

@@ -110,7 +110,7 @@ class RunningMoments(nn.Module):
     count: torch.Tensor  # () number of samples
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
-        """Create moments without samples; shape: shape of one sample, () for a scalar."""
+        """Create running moments without samples; shape: that of one sample, () for a scalar."""
         super().__init__()
         self.register_buffer("mean", torch.zeros(tuple(shape), dtype=torch.float64))
         self.register_buffer("var", torch.full(tuple(shape), 1.0 - VARIANCE_EPS, dtype=torch.float64))

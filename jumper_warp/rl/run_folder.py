@@ -47,7 +47,7 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
-    """Write the configuration of a run to its folder, which exists. Raises OSError."""
+    """Write the configuration of a training run to the run's folder, which exists. Raises OSError."""
     write_atomically(folder / CONFIG, json.dumps(config, indent=1).encode())
 
 

@@ -90,7 +90,7 @@ class Term(Copyable):
         self.num_params = len(params)
 
     def _check_types(self, where: str) -> None:
-        """Raise InputError unless the function's first argument is in `takes` and its result in `returns`."""
+        """Raise InputError unless the function has an allowed first argument (`takes`) and result (`returns`)."""
         if not self._leading():
             takes = " or ".join(kinds[0].key for kinds in self.takes)
             raise InputError(f"{where}: the first argument of the function must be annotated {takes}")

@@ -218,7 +218,7 @@ class ResetCfg:
         return self.ground.drawn
 
     def on_level_ground(self) -> ResetCfg:
-        """Return the configuration without sampled platforms and blocks."""
+        """Return a copy of the configuration without sampled platforms and blocks."""
         return replace(self, ground=GroundCfg())
 
     def _ranges(self, step_dt: float) -> Any:

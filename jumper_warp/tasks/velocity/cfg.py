@@ -141,5 +141,5 @@ class VelocityResetCfg:
         return terrain_map(self.terrain) if self.terrain.rows else None
 
     def on_level_ground(self) -> VelocityResetCfg:
-        """Return the configuration without a terrain map."""
+        """Return a copy of the configuration without a terrain map."""
         return replace(self, terrain=TerrainCfg.none())
