@@ -11,7 +11,7 @@ from .scalar import mat33, quat, real, vec3
 
 
 def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
-    """Return the C++ code with which the threads of a world exchange values, for CUDA and for the CPU.
+    """Return the C++ code by which threads of the same world exchange values, for CUDA and for the CPU.
 
     The code is `gpu` for CUDA; otherwise it writes `sent` to a box, waits, and reads `received`. gpu: CUDA statements
     that return the result. sent, received: C++ expressions; `received` may read all of `box[threads]`, which holds the
@@ -105,7 +105,7 @@ def from_leg(x: real, leg: int) -> real:
 
 @wp.func_native(_FIRST)
 def first_leg(flag: bool) -> int:
-    """Return the smallest index (0 to 3) of a world's legs whose threads set the flag, 0 if none does."""
+    """Return the smallest index (0 to 3) among a world's legs whose flag is true, 0 if none is."""
     ...
 
 
@@ -117,7 +117,7 @@ def least_of_attempts(x: int) -> int:
 
 @wp.func_native(_ALL)
 def all_of_attempt(flag: bool) -> bool:
-    """Return whether the flag is set in all four threads of a sampling attempt, which must make this call together."""
+    """Return whether the flag is true in all four threads of a sampling attempt; all of them must call it together."""
     ...
 
 

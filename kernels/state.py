@@ -13,7 +13,7 @@ from .scalar import quat, real, vec3
 
 @wp.struct
 class BaseState:
-    """Pose and velocity of the base link's origin."""
+    """Position, orientation, velocity and angular velocity of the base link's origin."""
 
     pos: vec3  # [m], world
     quat: quat  # xyzw, body to world
@@ -59,7 +59,7 @@ def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), co
 
 @wp.func
 def load_motors(values: wp.array(dtype=real), first: int) -> vec3:
-    """Return a leg's motor values (lateral, outer, inner) from its five joint values, from `first` on (`leg_coord`)."""
+    """Return a leg's three motor values (lateral, outer, inner) out of its five joint values, from `first` on."""
     return vec3(values[first], values[first + 1], values[first + 3])
 
 

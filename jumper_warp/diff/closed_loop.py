@@ -22,7 +22,7 @@ DOWN = (0.0, 0.0, -1.0)  # direction of gravity, world axes
 
 
 class LoopState(NamedTuple):
-    """State of robots and policy at the beginning of a policy step, worlds last.
+    """State of robots and policy at the beginning of a policy step, in parallel worlds.
 
     In the layout of `jumper_warp.diff.rollout.Trajectory`.
     """
@@ -41,7 +41,7 @@ class LoopState(NamedTuple):
 
 
 class RobotState(NamedTuple):
-    """State of base and motors from which observations and rewards are computed, worlds first."""
+    """State of base and motors from which observations and rewards are computed; the first axis is the world."""
 
     pos: torch.Tensor  # (num_worlds, 3) [m] base origin, world axes
     quat: torch.Tensor  # (num_worlds, 4) xyzw, body to world
@@ -77,12 +77,12 @@ def heading_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
-    """Return a tensor with the values of `value` and the derivatives of `computed`, of the same shape."""
+    """Return a tensor whose values are those of `value` and whose derivatives are those of `computed`."""
     return value + (computed - computed.detach())
 
 
 class ClosedLoop:
-    """Differentiable policy steps and observations of the robots of an environment.
+    """Differentiable policy steps and observations of an environment's robots under a policy.
 
     `advance` and `observe` are functions of tensors, in single or double precision; `step` also steps the
     environment and returns its values with derivatives.
@@ -146,7 +146,7 @@ class ClosedLoop:
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
     def _history_of(self, obs: torch.Tensor) -> torch.Tensor:
-        """Cut the earlier frames of observation terms with a history from the policy's observation.
+        """Select from the policy's observation the earlier values of all terms that have a history.
 
         As in `LoopState.history`. obs: (num_worlds, columns of the actor).
         """
@@ -154,7 +154,7 @@ class ClosedLoop:
         return torch.cat([obs[:, first:last] for first, last in ends] or [obs[:, :0]], 1).T
 
     def _histories(self, state: LoopState) -> list[torch.Tensor]:
-        """Return the earlier frames of each observation term that has a history, (num_worlds, frames * width) each."""
+        """Return earlier values of each observation term that has a history, (num_worlds, frames * width) each."""
         counts = [end - first - term.width for term, first, end in self._history_terms]
         return list(state.history.T.split(counts, 1)) if counts else []
 
@@ -169,7 +169,7 @@ class ClosedLoop:
         return torch.cat(frames, 1).T if frames else state.history
 
     def _frame(self, term: Any, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-        """Return one observation term computed from the robot's state, scaled and clipped, (num_worlds, width).
+        """Return an observation term's current values from the robot's state, scaled, clipped, (num_worlds, width).
 
         motion: of the state. observed: the environment's observation of the term, (num_worlds, width).
         """
@@ -199,7 +199,7 @@ class ClosedLoop:
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
-        """Return pose, velocity and motor angles of the robots, worlds first, from the state of the closed loop."""
+        """Convert the state of the closed loop to the robots' pose, velocity and motor angles, worlds first."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]

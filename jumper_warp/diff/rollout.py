@@ -71,7 +71,7 @@ class Trajectory:
     """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
     def end(self) -> dict[str, Any]:
-        """Return the final state as arguments of `Rollout.run` that continue it: q, qd, initial_target, impulse."""
+        """Return the final state as arguments with which `Rollout.run` continues: q, qd, initial_target, impulse."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 
@@ -173,7 +173,7 @@ class Rollout:
 
     @locked
     def hold(self, worlds: Any = True) -> None:
-        """Hold the bases at their initial pose and velocity in some worlds; release those of the others.
+        """Fix the bases of some worlds at their initial pose and velocity; release those of the others.
 
         worlds: bool, (num_worlds,) or one for all. Raises InputError: another shape.
         """
@@ -325,7 +325,7 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
-        """Collect the gradients of the loss w.r.t. the arrays of a trajectory in a struct for the reverse kernels.
+        """Collect the loss gradients w.r.t. the arrays of a trajectory in a struct, the input of the reverse kernels.
 
         Empty for None and filtered_target. Raises InputError: another shape or type than the trajectory's array.
         """
@@ -357,13 +357,13 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
-        """Return the numbers of policy and physics steps of a rollout as the struct that the kernels read."""
+        """Return the struct with a rollout's numbers of policy and physics steps, which the kernels read."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
     def _rows(self, count: int) -> Any:
-        """Allocate the arrays of a `Trajectory` of `count` policy steps, uninitialised."""
+        """Allocate the arrays that record a rollout of `count` policy steps, uninitialised."""
         steps, n = count * self.substeps, self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
@@ -422,11 +422,11 @@ class Rollout:
         return self.array(values)
 
     def array(self, values: Any) -> wp.array:
-        """Return a copy of values as a Warp array of the rollout's precision on its device."""
+        """Convert values to a new Warp array of the rollout's precision on its device."""
         return wp.array(values, dtype=self.real, device=self.device)
 
     def vectors(self, values: Any) -> wp.array:
-        """Return a copy of vectors (..., 3) as a Warp array (...) of the kernels' vec3, as in `Trajectory.impulse`."""
+        """Convert vectors (..., 3) to a new Warp array (...) of the kernels' vec3."""
         return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
 
     def _zeros(self, *shape: int, dtype: Any = None) -> wp.array:

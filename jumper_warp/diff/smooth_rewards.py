@@ -20,7 +20,7 @@ LANDING, RECOVERED = 18, 30  # policy steps after touchdown that count as landin
 
 
 class RewardContext(NamedTuple):
-    """Quantities from which the rewards of a policy step are computed, n worlds.
+    """States and flags from which the rewards of a policy step are computed, for n worlds.
 
     Phases and flags are those at the end of the step.
     """
@@ -44,7 +44,7 @@ class RewardContext(NamedTuple):
 def make_context(
     loop: ClosedLoop, state: LoopState, prev_state: LoopState, arrays: Mapping[str, np.ndarray]
 ) -> RewardContext:
-    """Collect the quantities from which the rewards of a policy step are computed.
+    """Collect the states and flags from which the rewards of a policy step are computed.
 
     The step leads from prev_state to state; arrays: `Env.task_arrays` before resets.
     """
@@ -65,7 +65,7 @@ def make_context(
 
 
 def gaussian(squared: torch.Tensor, std: float) -> torch.Tensor:
-    """Gaussian kernel of an error, 1 at zero error: exp(-squared / std^2).
+    """Return the Gaussian kernel of an error, 1 at zero error: exp(-squared / std^2).
 
     Shape of `squared`, the squared error; std: width in the unit of the error.
     """
@@ -83,7 +83,7 @@ def ballistic_apex(ctx: RewardContext) -> torch.Tensor:
 
 
 def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the closeness [1] of the ballistic apex to the commanded height, (n,), at most 5.
+    """Return a measure [1], at most 5, of how close the ballistic apex is to the commanded height, (n,).
 
     Constants: std_fine, scale_sharp, std_wide [m].
     """
@@ -96,12 +96,12 @@ def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Te
 
 
 def waiting_scale(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the factor that scales a reward while a jump is due: the constant `waiting_scale`, else 1. Shape (n,)."""
+    """Return the factor on a reward: the constant `waiting_scale` while a jump is due, else 1. Shape (n,)."""
     return torch.where(ctx.jump_due, const["waiting_scale"], 1.0)
 
 
 def posture(ctx: RewardContext, const: Mapping[str, float], shift: float) -> torch.Tensor:
-    """Return a measure of closeness [1] of the motor angles to the default pose, 1 at the pose.
+    """Return how close the motor angles are to the default pose, a number [1] that is 1 at the pose.
 
     Shape (n,); shift [rad]: added to transversal motors. Constants: std [rad].
     """
@@ -110,7 +110,7 @@ def posture(ctx: RewardContext, const: Mapping[str, float], shift: float) -> tor
 
 
 def symmetry(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return a measure of symmetry [1] of the legs: equal transversal angles and lateral angles of 0.
+    """Return how symmetric the legs are [1]: largest for equal transversal angles and lateral angles of 0.
 
     Shape (n,), the product of both closenesses. Constants: std_variance [rad^2], std_lateral [rad], waiting_scale [1].
     """

@@ -10,7 +10,7 @@ from jumper_warp.utils.newton_types import Model
 
 
 class Snapshot(NamedTuple):
-    """State and parameters of an environment's robots.
+    """State and parameters of an environment's robots, from which gradients are computed.
 
     Tensors are float32 on the environment's device and read-only; the next step may change them.
     """

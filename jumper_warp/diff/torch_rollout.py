@@ -33,7 +33,7 @@ class TorchTrajectory(NamedTuple):
     filtered_target: torch.Tensor  # (T, 12, num_worlds) [rad] targets after the command filter
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return the final state as arguments of `simulate` that continue it; `impulse` has no gradient."""
+        """Return the final state as arguments with which `simulate` continues; `impulse` has no gradient."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[-1].detach()}
 
@@ -99,7 +99,7 @@ def simulate(
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:
-    """Check tensor inputs of a rollout: raise InputError for a latency out of range.
+    """Raise InputError if a tensor of latencies for a rollout has values out of range.
 
     On a CPU also for commands that are not finite or parameters with NaN.
     """
@@ -157,7 +157,7 @@ class _Simulate(torch.autograd.Function):
 
 
 def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
-    """Convert the gradient w.r.t. an array of the trajectory from a tensor to a Warp array.
+    """Convert the gradient w.r.t. one array of a trajectory from a PyTorch tensor to a Warp array.
 
     name: of the array, whose type it gets; None (zero) stays None.
     """

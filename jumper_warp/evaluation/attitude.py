@@ -23,7 +23,7 @@ HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 
 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
-    """Return turns by an angle [deg], quaternions (count, 4), xyzw, body axes; row i turns about DIRECTIONS[i % 6]."""
+    """Return rotations by an angle [deg] about the body axes in turn (DIRECTIONS), as quaternions (count, 4), xyzw."""
     half, rows, quats = 0.5 * np.radians(angle), np.arange(count), np.zeros((count, 4))
     quats[rows, rows % 6 // 2] = np.where(rows % 2 == 0, 1.0, -1.0) * np.sin(half)  # even rows: plus, odd: minus
     quats[:, 3] = np.cos(half)
@@ -31,7 +31,7 @@ def axis_turns(count: int, angle: float) -> np.ndarray:
 
 
 def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
-    """Return turns by an angle [deg] about uniformly random axes, quaternions (count, 4), xyzw, body axes."""
+    """Return rotations by an angle [deg] about random body axes, as quaternions (count, 4), xyzw."""
     axis = np.random.default_rng(seed).normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     half = 0.5 * np.radians(angle)
@@ -40,7 +40,7 @@ def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
 
 @dataclass
 class AttitudeLog(EvaluationLog):
-    """Log of one commanded turn per world; properties have shape (num_envs,). A diverged world records NaN."""
+    """Log of a turn in flight per world; properties have shape (num_envs,). A diverged world records NaN."""
 
     turns: np.ndarray  # (num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the start
     tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
@@ -105,7 +105,7 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Subsets of the turns over which metrics are computed, by name: masks (num_envs,)."""
+        """Masks (num_envs,) that select the turns over which a metric is computed, by name."""
         return {"turns": np.full(self.count, True), "turns that settled": ~np.isnan(self.settling_time),
                 "turns that reached the goal": ~np.isnan(self.first_time),
                 "turns that did not diverge": ~self.diverged}  # fmt: skip
@@ -128,7 +128,7 @@ class AttitudeLog(EvaluationLog):
         return {"error/angle to goal, {} [deg]": np.degrees(error), "spin/angular speed, {} [rad/s]": speed}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commanded turns of some worlds: key `turns_xyzw`, a list of quaternions."""
+        """Return metadata of a recording: the commanded turns of some worlds, key `turns_xyzw`, quaternions."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
 
@@ -175,7 +175,7 @@ class AttitudeFlags:
         check(0.1 <= self.seconds <= 60.0, f"seconds must be in [0.1, 60], got {self.seconds}")
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
-        """Return the log of the turns, one per world; task and seed have no effect."""
+        """Return a new log of one turn per world about the body's axes; task and seed have no effect."""
         return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
@@ -195,5 +195,5 @@ class AttitudePlayFlags:
         check(0.0 < self.angle <= 180.0, f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:
-        """Return the log of six turns, one per robot, in the order of DIRECTIONS; task has no effect."""
+        """Return a new log of six turns, one per robot, in the order of DIRECTIONS; task has no effect."""
         return AttitudeLog(axis_turns(len(DIRECTIONS), self.angle), seconds=self.length)

@@ -80,7 +80,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class FilmCfg:
-    """Settings of a film of the recording."""
+    """Settings of the film that is made of a recorded simulation."""
 
     video: Path | None = None  # Film to write: .mp4 (H.264), .webp or .gif (default: none)
     size: tuple[int, int] = (854, 480)  # [px] Width and height
@@ -112,7 +112,7 @@ class FilmCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingCfg:
-    """Flags that all recordings share."""
+    """Common flags of the commands that record a simulation."""
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """Conditions of the simulation."""

@@ -55,7 +55,7 @@ NAMES = ("walk", "jump up", "jump to")  # By skill
 
 @dataclass
 class CourseLog(EvaluationLog):
-    """Log of one course per robot (world); samples after the end of a robot's course are NaN or ignored."""
+    """Log of one course (script of walks and jumps) per robot; samples after the end of a course are NaN or ignored."""
 
     scripts: Sequence[Sequence[ScriptStep]]  # One script per robot, all with the same number of commands
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
@@ -95,7 +95,7 @@ class CourseLog(EvaluationLog):
 
     @property
     def _at(self) -> np.ndarray:
-        """Index of each robot's current command, (robots,); of its last command after the end."""
+        """Index in its script of each robot's current command, (robots,); after the end that of its last command."""
         return np.minimum(self.current, self.target_skill.shape[1] - 1)
 
     @property
@@ -105,11 +105,11 @@ class CourseLog(EvaluationLog):
 
     @property
     def seconds(self) -> float:
-        """Maximum simulated time [s]."""
+        """Simulated time [s] after which all courses end at the latest."""
         return float((self.durations.sum(axis=1) + JUMP_TIMEOUT * (self.target_skill != WALK).sum(axis=1)).max()) + 1.0
 
     def warn_beyond_training(self, tasks: Sequence[TaskCfg]) -> None:
-        """Print one line for each task with commands beyond its training on standard error; tasks: by skill."""
+        """Print a warning for each skill whose commands exceed those of its training; tasks: of the skills."""
         for skill, task in enumerate(tasks):
             if (chosen := self.target_skill == skill).any():
                 warn_beyond_training(task, self.goal[chosen])
@@ -123,7 +123,7 @@ class CourseLog(EvaluationLog):
         self._request_jumps(env, np.full(len(self.end), True))
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return arrays (robots, ...) by name: base state, active skill, termination, paw forces [N], `jump_` state.
+        """Return by name what `update` records, (robots, ...): base, skill, termination, paw forces [N], jump state.
 
         Base position [m], quaternion (xyzw), velocity [m/s] and angular velocity [rad/s] are in world axes. `jump_`
         arrays are fields of the current command's jump skill, or of JUMP_UP while the robot walks.
@@ -143,7 +143,7 @@ class CourseLog(EvaluationLog):
         return arrays
 
     def record_step(self, env: Any) -> bool:
-        """Record a policy step, then set due commands and policies of the robots; return whether all have finished."""
+        """Record a policy step, then send each robot its next command if it is due; return whether all are done."""
         before, previous = self.current.copy(), self._skill
         ended = super().record_step(env)
         rows, at, running = np.arange(len(before)), self._at, self.end < 0
@@ -173,7 +173,7 @@ class CourseLog(EvaluationLog):
             env.sim.solver.place_blocks(goals, begins.tolist())
 
     def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
-        """Request the jump of every robot in `worlds`, (robots,) bool, whose current command is a jump."""
+        """Request the jump from those robots in `worlds`, (robots,) bool, whose current command is a jump."""
         rows, at = np.arange(len(worlds)), self._at
         for skill in (JUMP_UP, JUMP_TO):
             requested = worlds & (self.target_skill[rows, at] == skill)
@@ -264,7 +264,7 @@ class CourseLog(EvaluationLog):
 
     @property
     def on_goal(self) -> np.ndarray:
-        """Whether each command finished, jumps within GOAL_TOLERANCE of their goal, (robots, commands)."""
+        """Whether each command was completed, a jump within GOAL_TOLERANCE of its goal, (robots, commands)."""
         error = np.where(self.target_skill == JUMP_UP, np.abs(self.apex_error), self.landing_error)
         near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
@@ -278,21 +278,21 @@ class CourseLog(EvaluationLog):
         return listed({"end": self.outcomes, "commands_done": (self.finish_step >= 0).sum(axis=1)} | worst)
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the current velocity, command and base height [m] of all robots."""
+        """Return values to plot: the current velocity, command and base height [m] of all robots."""
         series = velocity_series(self.velocity[-1], self.marks()["commands"])
         return series | {"height/base, {} [m]": self.height[-1]}
 
     def states(self) -> dict[str, np.ndarray]:
-        """Return the skill that was active in all robots' last policy step."""
+        """Return the name of the skill that each robot used in the last policy step, for recordings."""
         return {"skill/{}": np.array(NAMES)[self.skills[-1]]}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return the goals of all robots' jumps, z = 0, NaN for others, and the commands, 0 while it does not walk."""
+        """Return what recordings draw of all robots: goals of their jumps, NaN if none, and commanded velocities."""
         goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
         return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the scripts of some robots: key `scripts`, lists of [kind, *values]."""
+        """Return metadata of a recording: the scripts of some robots, key `scripts`, lists of [kind, *values]."""
         return {"scripts": [[[step.kind, *step.values] for step in self.scripts[world]] for world in worlds]}
 
 
@@ -342,7 +342,7 @@ def course_metrics(course: CourseLog) -> Metrics:
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return ripple and step of the paw force [N] at all handovers to a jump, (handovers,) each.
+    """Return the paw force's ripple before, and step at, each handover to a jump [N], (handovers,) each.
 
     Ripple: peak-to-peak force over the last FORCE_WINDOW seconds before the handover; step: change of the force between
     the policy steps before and after it. Each is the maximum over the four paws.
@@ -359,7 +359,7 @@ def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]]:
-    """Return the sequence of a robot's active skills: tuples of skill (WALK, JUMP_UP, JUMP_TO), begin and end [s]."""
+    """Return when a robot used which skill: tuples of skill (WALK, JUMP_UP, JUMP_TO), begin and end [s], in order."""
     skills = np.array(course.skills)[:, world]
     edges = [0, *(np.flatnonzero(np.diff(skills)) + 1).tolist(), len(skills)]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]

@@ -48,7 +48,7 @@ class EpisodeLog(EvaluationLog):
         self.identical = count > 1  # Whether all worlds have been in equal states so far
 
     def begin(self, env: Env) -> None:
-        """Reset every world to the default pose with its command, or as in training, with commands of all levels."""
+        """Reset every world to the default pose with its command or, without commands, to a start state of training."""
         if self.commands.shape[1]:
             env.evaluation_reset(self.commands)
         else:
@@ -102,19 +102,19 @@ class EpisodeLog(EvaluationLog):
         return listed(columns | {"end": self.outcomes})
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the current base height and horizontal distance from the start [m] of all worlds."""
+        """Return values to plot: base height and horizontal distance from the start [m] of all worlds."""
         pos = self.arrays["base_pos"]
         distance = np.linalg.norm((pos - self.start_position)[:, :2], axis=1)
         return {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
-        """Return numbers of some worlds, and their commands: "episode 1, command 0.6 0"."""
+        """Return titles of some worlds, such as "episode 1, command 0.6 0"."""
         commands = [" ".join(["", *(f"{value:g}" for value in self.commands[world])]) for world in worlds]
         pairs = zip(super().labels(worlds), commands, strict=True)
         return [f"{name}, command{command}" if command else name for name, command in pairs]
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands of some worlds: key `commands`, a list of rows."""
+        """Return metadata of a recording: the commands of some worlds, key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
 
@@ -169,7 +169,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Repeat a command for `count` worlds, padded with zeros to the least size n of the task's command: (count, n).
+    """Return a command as one row per world, (count, n), with zeros for numbers that it leaves out.
 
     An empty command stays empty: (count, 0).
     """
@@ -192,7 +192,7 @@ class EpisodeFlags:
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
-        """Return a new log of episodes with the flags' command in all worlds.
+        """Return a new log of one episode per world with the flags' command.
 
         seed has no effect: the environment's random streams sample the commands.
         """
@@ -212,7 +212,7 @@ class EpisodeFlags:
 
 @dataclass(frozen=True)
 class EpisodePlayFlags:
-    """Flags of a recorded episode."""
+    """Flags of a recorded episode of one robot."""
 
     command: tuple[float, ...] = ()
     """Up to four values of the task's command; omitted ones are 0 (default: the task's reset samples each command)."""
@@ -223,5 +223,5 @@ class EpisodePlayFlags:
         check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> EpisodeLog:
-        """Return the log of one robot's episode of at most `length`."""
+        """Return a new log of one robot's episode of at most `length` [s]."""
         return EpisodeLog(tile_command(self.command, 1, task), task, self.length)

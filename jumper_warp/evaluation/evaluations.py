@@ -26,7 +26,7 @@ from jumper_warp.utils.metrics import Metrics
 
 
 class EvaluationFlags(Protocol):
-    """Interface of a dataclass with the flags of `jumper evaluate` for one kind of task, such as jumps to heights."""
+    """Interface of a dataclass with the flags of `jumper evaluate` for some tasks, such as jumps to heights."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
         """Return a new log with the commands of all worlds; seed: seed of sampled commands."""
@@ -38,7 +38,7 @@ class EvaluationFlags(Protocol):
 
 
 class PlayFlags(Protocol):
-    """Protocol of the flags of `jumper play` for a kind of task; a frozen dataclass."""
+    """Interface of a frozen dataclass with the flags of `jumper play` for some tasks, such as jumps to heights."""
 
     @property
     def length(self) -> float:

@@ -86,7 +86,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
 
 
 def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg: FinetuneCfg) -> Anchor:
-    """Return the trust region around the network's actions on a sample of observations from all groups.
+    """Return a penalty on changes of the network's actions at observations that are sampled from all groups of jumps.
 
     Observations are sampled from the first TRUST_REGION_SECONDS; after touchdown the allowed change of the actions is
     `cfg.landing_std`, before it `cfg.action_std`.
@@ -128,7 +128,7 @@ def correct_aim(
     """
 
     def measure(policy: Policy) -> tuple[float, list[JumpErrors], dict[str, dict[str, float]]]:
-        """Run the jumps of a policy; return their cost [1], errors by group, and mean errors [m]."""
+        """Simulate the jumps of a policy; return their cost [1], errors by group, and mean errors [m]."""
         network = Network(policy, device=groups[0].env.device)
         errors = [jump_errors(group, network, derivatives=False) for group in groups]
         pairs = list(zip(groups, errors, strict=True))
@@ -167,7 +167,7 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Run the jumps with the current weights; return the cost [1], trust region included, and the errors."""
+        """Simulate the jumps with the current weights; return the cost [1], trust region included, and the errors."""
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)

@@ -26,7 +26,7 @@ HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, as of robots t
 
 
 class JumpErrors(NamedTuple):
-    """Errors of a group of n jumps in apex height or landing position, with derivatives.
+    """Errors of n jumps in apex height or landing position, and their derivatives w.r.t. the network's weights.
 
     m = n for apex heights, m = 2n for landing positions (all x, then all y, world).
     """
@@ -38,7 +38,7 @@ class JumpErrors(NamedTuple):
 
 @dataclass
 class JumpGroup:
-    """Group of jumps in one environment with fixed commands."""
+    """Environment of robots that make one jump each, with fixed commands."""
 
     name: str  # Name of the group in logs and records
     env: Env  # Environment of n worlds, one jump each
@@ -48,18 +48,18 @@ class JumpGroup:
     loop: ClosedLoop = field(init=False)  # Differentiable steps of the same robots
 
     def __post_init__(self) -> None:
-        """Save the environment's state, so that every run samples the same robots."""
+        """Save the environment's state, from which every run of the jumps begins with the same robots."""
         self._initial_state = self.env.state_dict()
         self.loop = ClosedLoop(self.env)
 
     def begin(self) -> None:
-        """Reset all robots to the state at construction and set their commands."""
+        """Reset all robots to their state when the group was made, and command their jumps."""
         self.env.load_state_dict(self._initial_state)
         self.env.evaluation_reset(self.commands)
         self.loop.read_parameters()
 
     def importance(self, errors: JumpErrors) -> torch.Tensor:
-        """Return the weights (m,) of the jumps' errors in the fine-tuning cost.
+        """Return the weights (m,) that the errors of the jumps have in the cost that fine-tuning reduces.
 
         A weight is the Huber weight / (std² · number of errors), 0 for an invalid jump.
         """
@@ -83,7 +83,7 @@ def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Te
 
 
 def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
-    """Run the jumps of a group with a network as policy, and return their errors; derivatives: with Jacobian."""
+    """Simulate the jumps of a group under a network's actions, and return their errors; derivatives: with Jacobian."""
     env, loop, to_height = group.env, group.loop, group.to_height
     group.begin()
     begin, last = int(group.commands[:, 3].min()), int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)

@@ -94,7 +94,7 @@ def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: 
 
 
 def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:
-    """Return success rates and mean errors of the jumps with goals within a range, as `in_range_<key>`.
+    """Return success rates and mean errors of those jumps whose goals are within a range, as `in_range_<key>`.
 
     Keys: IN_RANGE; inside: mask of these jumps; note: description of the range.
     """
@@ -117,7 +117,7 @@ class JumpFlags:
             raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
 
     def metrics(self, log: JumpLog) -> Metrics:
-        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
+        """Return the metrics of a finished log of jumps: of all, and of those with goals within `success_range`."""
         (low, high), outcome = self.success_range, log.outcome
         size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance; the other is 0
         inside = within(size, self.success_range)
@@ -153,7 +153,7 @@ class HeightPlayFlags:
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
     def log(self, task: TaskCfg) -> JumpLog:
-        """Return a new log of one recorded jump per robot."""
+        """Return a new log of one jump per robot to the flags' heights."""
         return JumpLog(np.array(self.height), task.termination_names)
 
 
@@ -202,7 +202,7 @@ class LandingPlayFlags:
 
     @property
     def goals(self) -> tuple[Position2D, ...]:
-        """First goal of each robot [m], ahead and to the left."""
+        """First goal of each robot [m], ahead of it and to its left."""
         return self.goal or self.default_goals
 
     @property
@@ -211,5 +211,5 @@ class LandingPlayFlags:
         return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.next_goals)
 
     def log(self, task: TaskCfg) -> JumpLog:
-        """Return the log of the jumps: each robot jumps to its goal of `goals`, then to all `next_goals`."""
+        """Return a new log of the jumps: each robot jumps to its entry of `goals`, then to all `next_goals`."""
         return JumpLog(np.array([[goal, *self.next_goals] for goal in self.goals]), task.termination_names)

@@ -33,7 +33,7 @@ TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 
 
 def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with the terminations of evaluated jumps, TERMINATIONS, if it has them, in this order.
+    """Return a copy of a task that keeps only the terminations for evaluated jumps, in the order of TERMINATIONS.
 
     Terminations for training are left out.
     """
@@ -42,7 +42,7 @@ def with_jump_terminations(task: TaskCfg) -> TaskCfg:
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of a task with the authors' termination at a second takeoff, which precedes success."""
+    """Return a copy of a task whose episodes also end, before success, at a second takeoff (the authors' rule)."""
     task = with_jump_terminations(task)
     takeoff = TerminationTerm(second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
@@ -54,7 +54,7 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
-    """Return contacts and positions of the paws FL, FR, BL, BR, and the upward speed of the base.
+    """Return by name whether each paw touches the ground, the paws' positions [m], and the base's upward speed [m/s].
 
     `paws_down` (num_envs, 4): whether they touch ground; `paw_pos` (num_envs, 4, 2): centres x, y [m], world; `up`
     (num_envs,) [m/s].
@@ -65,7 +65,7 @@ def paw_arrays(env: Env) -> dict[str, np.ndarray]:
 
 
 def updated_apex(apex: np.ndarray, jump: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the apexes of n jumps [m] after another policy step, (n,): largest base heights in flight.
+    """Return the largest base height in flight [m] of n jumps so far, (n,), after another policy step.
 
     Before takeoff an apex is the current height; after touchdown it stays. jump: arrays (n, ...) of the step.
     """
@@ -75,7 +75,7 @@ def updated_apex(apex: np.ndarray, jump: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
-    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and policy step of the command.
+    """Return jump commands for an environment, (num_envs, 4): goal x, y, z [m], and policy step of the command.
 
     goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 for any;
     delay [s]: time until the jump is commanded, (num_envs,) or one for all.
@@ -119,7 +119,7 @@ class JumpOutcome:
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Subsets of the jumps over which metrics are computed, by name: masks of the shape of the arrays."""
+        """Masks, shaped as the arrays, that select the jumps over which a metric is computed, by name."""
         return {
             "jumps": self.commanded, "jumps that touched down": self.touched_down, "landed jumps": self.landed,
             "successful jumps": self.success, "jumps that did not diverge": self.commanded & ~self.diverged,
@@ -137,16 +137,16 @@ class JumpOutcome:
 
 
 def jump_outcome(jumps: JumpLog) -> JumpOutcome:
-    """Compute the outcomes of recorded jumps from the log's arrays."""
+    """Compute events and errors of the jumps that a log has recorded."""
     ends, to_height, commanded = jumps.ends, jumps.goals[..., 2] > 0.0, jumps.ends != NOT_BEGUN
     landed, diverged = ends == SUCCESS, ends == DIVERGED
 
     def known(values: np.ndarray) -> np.ndarray:
-        """Replace values by NaN where the simulation diverged."""
+        """Return the values, with NaN where the simulation diverged."""
         return np.where(diverged | ~np.isfinite(values), np.nan, values)
 
     def goal_distance(position: np.ndarray) -> np.ndarray:
-        """Return the distances of positions (..., 2) from the goals, NaN where the simulation diverged."""
+        """Return the distances [m] of positions (..., 2) from the jumps' goals, NaN where the simulation diverged."""
         return known(np.linalg.norm(position - jumps.goal_world, axis=-1))
 
     ahead, left = np.moveaxis(turn_plane(jumps.rest_position - jumps.goal_world, -jumps.heading), -1, 0)
@@ -170,7 +170,7 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
 
 
 class JumpLog(EvaluationLog):
-    """Log of a sequence of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
+    """Log of one or more jumps in a row per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
 
     The goal of the first jump is relative to start and heading. Goals of further jumps are relative to base position
     and yaw at their command. A jump's entries do not change after its end.
@@ -251,7 +251,7 @@ class JumpLog(EvaluationLog):
         return env.task_arrays() | paw_arrays(env)
 
     def record_step(self, env: Env) -> bool:
-        """Record a policy step, command the next jumps that are due; return whether all jumps have ended."""
+        """Record a policy step, and command the next jump where one has ended; return whether all have ended."""
         before = self.current.copy()
         ended = super().record_step(env)
         due = (self.current > before) & (self.current < self.goals.shape[1])
@@ -331,7 +331,7 @@ class JumpLog(EvaluationLog):
 
     @property
     def outcome(self) -> JumpOutcome:
-        """Outcomes of the recorded jumps."""
+        """Events and errors of all recorded jumps, such as touchdown, success and apex error."""
         return jump_outcome(self)
 
     @property
@@ -346,7 +346,7 @@ class JumpLog(EvaluationLog):
         return np.where(names == "", self.ends, names)
 
     def columns(self) -> dict[str, list]:
-        """Return goals, headings, the fields of `JumpOutcome` and outcomes, one value per jump, world after world."""
+        """Return the results of all jumps by name, one value per jump: goal, heading, events, errors and outcome."""
         columns = {name: self.goals[..., i].ravel() for i, name in enumerate(("goal_x_m", "goal_y_m", "goal_height_m"))}
         columns |= {"heading_deg": np.degrees(self.heading).ravel(), **self.outcome.arrays()}
         return listed(columns | {"outcome": self.outcomes.ravel()})
@@ -356,7 +356,7 @@ class JumpLog(EvaluationLog):
         return self.goals
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the current base height, and commanded height or distance of the base from the current goal, [m]."""
+        """Return values to plot: base height, and commanded height or the base's distance from the goal, [m]."""
         series = {"height/base, {} [m]": self.arrays["base_pos"][:, 2]}
         if self.to_heights:
             return series | {"height/command, {} [m]": self.goals[:, 0, 2]}
@@ -364,22 +364,22 @@ class JumpLog(EvaluationLog):
         return series | {"distance/to goal, {} [m]": np.linalg.norm(offset, axis=1)}
 
     def states(self) -> dict[str, np.ndarray]:
-        """Return the current phases of all worlds' jumps, entries of PHASES."""
+        """Return the current phase of each world's jump, an entry of PHASES, for recordings."""
         return {"phase/{}": np.array(PHASES)[self.arrays["phase"]]}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return the commanded heights, or the goals in the world frame with z = 0."""
+        """Return what recordings draw: commanded heights of all worlds, or goals in the world frame with z = 0."""
         if self.to_heights:
             return {"heights": self.goals[:, 0, 2]}
         return {"goals": np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the goals [m] of some worlds: key `targets_m` for heights, `goals_m` for places."""
+        """Return metadata of a recording: goals [m] of some worlds, heights as `targets_m`, places as `goals_m`."""
         goals = self.goals[list(worlds)]
         return {"targets_m": goals[:, 0, 2].tolist()} if self.to_heights else {"goals_m": goals[..., :2].tolist()}
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
-        """Return the first goals of some worlds in metres: "0.90 m" up or ahead, or "(0.80, 0.20) m" ahead and left."""
+        """Return titles of some worlds, their first goals in metres: "0.90 m" (up or ahead) or "(0.80, 0.20) m"."""
         goals = self.goals[list(worlds), 0]
         return [f"{x + height:.2f} m" if y == 0.0 else f"({x:.2f}, {y:.2f}) m" for x, y, height in goals]
 

@@ -52,14 +52,14 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def series(self) -> dict[str, np.ndarray]:
-        """Return current values to plot of all worlds, (num_envs,), by `group/quantity, {} [unit]`; {}: its name."""
+        """Return values to plot of all worlds, (num_envs,) each, by name `group/quantity, {} [unit]`; {}: the world."""
 
     def states(self) -> dict[str, np.ndarray]:
         """Return current states of all worlds as text, (num_envs,), such as phases of jumps, by `quantity/{}`."""
         return {}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw of all worlds, by name.
+        """Return the goals, heights and commands that recordings draw, for all worlds, by name.
 
         `goals` [m] (num_envs, goals per world, 3), world frame; `heights` [m] (num_envs,), commanded, of the base at
         the apex; `commands` (num_envs, 3), current velocities ahead, left [m/s], about z [rad/s], body axes.
@@ -67,11 +67,11 @@ class EvaluationLog(ABC):
         return {}
 
     def all_commands(self) -> np.ndarray | None:
-        """Return the commands of all worlds, (..., 3), as in `evaluation.trained`; None if these have no range."""
+        """Return all worlds' commands (..., 3), to compare with their ranges in training; None: they have no ranges."""
         return None
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
-        """Return the names of some worlds in recordings and pictures, such as their goals in metres."""
+        """Return titles of some worlds for recordings and pictures, such as their goals in metres."""
         return [f"{self.row_name} {world + 1}" for world in worlds]
 
     def names(self, worlds: Sequence[int]) -> list[str]:
@@ -83,7 +83,7 @@ class EvaluationLog(ABC):
         ]
 
     def named(self, values: Mapping[str, Any], worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the values of some worlds, of `series` or `states`, by key with the world's name in place of {}."""
+        """Select some worlds' entries of `series` or `states`, with the world's name in each key in place of {}."""
         names = list(zip(self.names(worlds), worlds, strict=True))
         return {key.format(name): values[key][world] for name, world in names for key in values}
 
@@ -129,7 +129,7 @@ def run_evaluation(
 
 
 def check(condition: bool, message: str) -> None:
-    """Raise InputError with the message unless the condition holds."""
+    """Raise InputError with a message unless a condition holds."""
     if not condition:
         raise InputError(message)
 
@@ -145,7 +145,7 @@ def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metr
 
 
 def listed(columns: Mapping[str, np.ndarray]) -> dict[str, list]:
-    """Convert arrays (n,) by name to lists for JSON, with None for NaN and infinity."""
+    """Convert arrays (n,) by name to lists that JSON can hold, with None for NaN and infinity."""
     lists = {name: values.tolist() for name, values in columns.items()}
     return {
         name: [None if isinstance(value, float) and not np.isfinite(value) else value for value in values]

@@ -67,11 +67,11 @@ class EnvRecorder:
         )  # fmt: skip
 
     def _marks(self) -> dict[str, np.ndarray]:
-        """Return the log's `marks` of the recorded worlds."""
+        """Return goals, heights and commands of the recorded worlds, which the log's `marks` gives."""
         return {name: values[self.worlds] for name, values in self.log.marks().items()}
 
     def _motor_series(self) -> dict[str, float]:
-        """Return values of the first recorded world's paws and motors, by name of the series.
+        """Return paw forces, motor torques and actions of the first recorded world, to plot, by name of the series.
 
         Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
         """

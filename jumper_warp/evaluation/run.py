@@ -152,7 +152,7 @@ class Run(ABC):
         return values
 
     def note_robot(self, env: Env) -> None:
-        """Keep the robot overlay of an environment, and the ranges of randomisation around it, for the report."""
+        """Remember for the report an environment's robot overlay, and the ranges of randomisation around it."""
         if env.overlay is None:
             return
         if self.conditions.robot is None:
@@ -196,7 +196,7 @@ class Run(ABC):
         return read_values(self.folder)
 
     def summarise(self, count: str, keys: Iterable[str], **settings: Any) -> None:
-        """Print the summary of `metrics.json`; count: number and kind of trials; settings: of `print_summary`."""
+        """Print a summary of `metrics.json`; count: number and kind of trials; settings: see `print_summary`."""
         name, count = self.name.replace("_", " "), f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
@@ -206,7 +206,7 @@ class Run(ABC):
     def report(
         self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
     ) -> dict[str, Any]:  # fmt: skip
-        """Write the metrics, print those with the given keys beside the paper's values, and return all values."""
+        """Write all metrics, print those with the given keys beside the paper's values, and return the values."""
         values = self.write(metrics)
         ends = [key for key in metrics if key.startswith("ended_by_")]
         ends = sorted(ends, key=lambda key: metrics[key].value or 0.0, reverse=True)[:MOST_ENDS]  # pyright: ignore

@@ -164,7 +164,7 @@ class Consecutive(Suite):
 
 
 def running_positions(jumps: JumpLog) -> np.ndarray:
-    """Return the current base positions x, y [m], (worlds, 2), world frame; NaN if a world's last jump has ended."""
+    """Return the base positions x, y [m] of robots that still jump, (worlds, 2), world frame; NaN for the others."""
     running = jumps.current < jumps.goals.shape[1]
     return np.where(running[:, None], jumps.arrays["base_pos"][:, :2], np.nan)
 
@@ -215,7 +215,7 @@ class Platform(Suite):
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
     def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
-        """Yield name, keywords of `Env`, and headings [rad], (num_envs,), of each scene; goals [m]: (num_envs, 2)."""
+        """Yield each ground: name, arguments for `Env`, headings [rad] (num_envs,); goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
         bumps = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
@@ -227,7 +227,7 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def outlines(self, goals: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the outlines of platform, median block, and level ground among bumps, for `plot_landings`."""
+        """Return by scene what plots outline on the ground: platform, block, and level ground among bumps."""
         x, y = np.median(goals, axis=0)
         block = rectangle(self.edge, x + BLOCK_BEYOND, y - 0.5 * BLOCK_WIDTH, y + 0.5 * BLOCK_WIDTH)
         level = regular_polygons(np.zeros((1, 2)), FLAT_RADIUS)
@@ -313,7 +313,7 @@ class Farthest(Suite):
 
 
 def plot(run: EvaluationRun, file: str, title: str, logs: dict[str, JumpLog], words: str, **options: Any) -> None:
-    """Plot goals and landing positions of first jumps; logs: by scene; words: numbers; options: of `plot_landings`."""
+    """Plot goals and landings of each robot's first jump; logs: by scene; words: numbers; options: `plot_landings`."""
     points = {name: (log.goals[:, 0, :2], log.landing[:, 0], log.success[:, 0]) for name, log in logs.items()}
     conditions = f"{run.title}, {words}"
     plot_landings(

@@ -60,7 +60,7 @@ class Suite(EvaluationArgs, ABC):
         """Run the jumps, write plots into `run.folder`, and return the metrics by key."""
 
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
-        """Evaluate the policy, report and return the metrics; modules: the user's task modules.
+        """Run the suite on its policy, write and print the metrics, and return them; modules: the user's task modules.
 
         Raises PolicyError, CheckpointError or InputError, see `EvaluationRun.from_args`.
         """
@@ -68,7 +68,7 @@ class Suite(EvaluationArgs, ABC):
         return run.report(metrics, self.paper, self.summary)
 
     def evaluate(self, modules: Iterable[ModuleType] = ()) -> tuple[EvaluationRun, Metrics]:
-        """Return the finished evaluation and its metrics, which are neither written nor printed; as `run`."""
+        """Run the suite on its policy; return the evaluation and the metrics, without writing or printing them."""
         run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         run.settings["rest_s"] = self.rest_time
         return run, self.measure(run)
@@ -96,16 +96,16 @@ class Sweep(Suite):
     @property
     @abstractmethod
     def flags(self) -> HeightFlags | LandingFlags:
-        """Flags of `jumper evaluate` that define the jumps of this suite."""
+        """Flags with which `jumper evaluate` runs the same jumps as this sweep."""
 
     def run_sweep(self, run: EvaluationRun, env: Env, film: str = "") -> JumpLog:
-        """Run one jump per goal, and return the log; film: name of the recording."""
+        """Simulate one jump to each goal of the sweep, and return the log; film: name of the recording."""
         log = self.flags.log(env.task, self.stream_seed)
         log.rest = self.rest_time
         return run.run_episodes(env, log, film=film)
 
     def pushed_in_flight(self, run: EvaluationRun, change: Callable[[TaskCfg], TaskCfg]) -> Metrics:
-        """Repeat the test with pushes in flight; return the metrics `pushed` as `pushed_in_flight_<key>`.
+        """Repeat the sweep with robots that are pushed in flight, and return its metrics as `pushed_in_flight_<key>`.
 
         Empty for nominal robots, and if the test itself pushes in flight. change: see `EvaluationRun.env`.
         """
@@ -150,7 +150,7 @@ class HeightSweep(Sweep):
 
     @property
     def flags(self) -> HeightFlags:
-        """Flags of `jumper evaluate` that define the jumps of this suite."""
+        """Flags with which `jumper evaluate` runs the same jumps as this sweep."""
         return HeightFlags(self.num_jumps, height_range=self.height_range)
 
     def measure(self, run: EvaluationRun) -> Metrics:
@@ -202,7 +202,7 @@ class DistanceSweep(Sweep):
 
     @property
     def flags(self) -> LandingFlags:
-        """Flags of `jumper evaluate` that define the jumps of this suite."""
+        """Flags with which `jumper evaluate` runs the same jumps as this sweep."""
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 

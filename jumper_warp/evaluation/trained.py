@@ -22,7 +22,7 @@ TOLERANCE = 1.0e-6  # [m], [m/s], [rad/s] Distance from a range that counts as r
 
 
 class Bounds(NamedTuple):
-    """Range of one component of a command in training."""
+    """Range of values that one component of a command has in training."""
 
     index: int  # Column in a command: x, y, z, or velocity ahead, to the left, about z
     name: str
@@ -50,7 +50,7 @@ def trained_bounds(task: TaskCfg) -> tuple[Bounds, ...]:
 
 
 def trained_range(task: TaskCfg) -> dict[str, list[float]]:
-    """Return the range of commands that a task samples at any level, by name; empty unless it jumps or walks.
+    """Return the ranges of the commands that a task samples in training, by name; empty unless it jumps or walks.
 
     `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
     velocities ahead, back, to either side [m/s] and about z [rad/s].
@@ -64,7 +64,7 @@ def trained_range(task: TaskCfg) -> dict[str, list[float]]:
 
 
 def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
-    """Print one line on standard error if components of commands are beyond their ranges in training.
+    """Print a warning on standard error if commands are beyond the ranges of the task's training.
 
     commands: (..., 3), x, y, z [m] or velocities [m/s], [m/s], [rad/s]; the line names the farthest value of each
     component. None: no line.
@@ -80,7 +80,7 @@ def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
 
 
 def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
-    """Return the success rates of jumps with first goals within and beyond the training, if there are both.
+    """Return the success rates of jumps to first goals within and beyond the range of training, if there are both.
 
     Keys: `within_training_success_rate`, `beyond_training_success_rate`.
     """
@@ -99,7 +99,7 @@ def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
 
 
 def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:
-    """Print one line on standard error if numbers of the state at the start are beyond those of resets in training.
+    """Print a warning on standard error if the robot starts in a state beyond those that training samples.
 
     start: columns `start_<field>` of the first episode. Numbers that RESETS resets never vary are skipped.
     """

@@ -33,7 +33,7 @@ MAX_ROBOTS = 20_000  # Maximum number of robots in a test
 
 @dataclass
 class VelocityLog(EvaluationLog):
-    """Velocity-tracking log, one robot per world; samples after a robot's fall are ignored."""
+    """Log of walks with commanded velocities, one robot per world; samples after a robot's fall are ignored."""
 
     commands: np.ndarray  # (robots, commands, 3) Commands in order: ahead, left [m/s], about z [rad/s], body axes
     task: TaskCfg
@@ -70,12 +70,12 @@ class VelocityLog(EvaluationLog):
         self._start = env.sim.joint_q()[:, :3].copy()
 
     def _slewed(self, last: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return the commands (robots, 3) one policy step after `last`, changed towards `target` at the slew rate."""
+        """Return commands (robots, 3) that change from `last` toward `target` by at most a policy step's slew rate."""
         limit = (self._slew * self.step_dt)[:, None]
         return np.where(np.isinf(limit), target, last + np.clip(target - last, -limit, limit))
 
     def _target(self, steps: ArrayLike) -> np.ndarray:
-        """Return the commanded velocities before the limit on their rate, at policy steps (n,).
+        """Return the scheduled velocity commands at policy steps (n,), before their rate of change is limited.
 
         The result is (n, robots, 3).
         """
@@ -83,7 +83,7 @@ class VelocityLog(EvaluationLog):
         return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return base state and termination of the robots for `update`, and set due commands.
+        """Return base state and termination of all robots for `update`, and send the commands for the next step.
 
         Keys: base_pos, base_quat (xyzw), base_vel, base_ang_vel (world axes), termination.
         """
@@ -146,7 +146,7 @@ class VelocityLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Subsets of the robots over which metrics are computed, by name: masks (robots,)."""
+        """Masks (robots,) that select the robots over which a metric is computed, by name."""
         stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
@@ -167,11 +167,11 @@ class VelocityLog(EvaluationLog):
         return error
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the current velocities and commands of all robots."""
+        """Return values to plot: the current velocities and commands of all robots."""
         return velocity_series(self.velocity[-1], self.command_history()[-1])
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands of some robots and their times: keys `commands`, `times_s`."""
+        """Return metadata of a recording: commands of some robots and their times, keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
     def all_commands(self) -> np.ndarray:
@@ -179,7 +179,7 @@ class VelocityLog(EvaluationLog):
         return self.commands
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return the current commands of all robots."""
+        """Return what recordings draw: the current commanded velocities of all robots."""
         return {"commands": self.command_history()[-1]}
 
 
@@ -203,7 +203,7 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray) -> dict[str, np.n
 
 
 def square_sums(error: np.ndarray) -> np.ndarray:
-    """Sum the squares of tracking errors over time, and count the values, without NaN: (robots, 3, 2).
+    """Sum squared tracking errors over time, and count them, without NaN: (robots, 3, 2).
 
     error: (steps, robots, 3).
     """
@@ -261,7 +261,7 @@ class VelocityFlags:
             raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
-        """Return the log of walks; seed: for the order of the commands after the first."""
+        """Return a new log of walks, one robot per world; seed: for the order of the commands after the first."""
         rng, grid = np.random.default_rng(seed), command_grid(self.commands_per_axis, self.max_velocity)
         times = np.arange(0.0, self.seconds - 1.0e-9, self.command_interval)
         commands = np.concatenate([grid, *(rng.permutation(grid) for _ in times[1:])], axis=1)
@@ -300,7 +300,7 @@ class VelocityPlayFlags:
         return self.command_interval * len(self.velocities)
 
     def log(self, task: TaskCfg) -> VelocityLog:
-        """Return the log of one robot's walk with the commands `velocities` in sequence."""
+        """Return a new log of one robot's walk with the commands `velocities` in sequence."""
         commands = np.array(self.velocities, dtype=float)[None]
         return VelocityLog(commands, task, self.length, times=self.command_interval * np.arange(commands.shape[1]))
 

@@ -131,7 +131,7 @@ class Actuator:
     chi2: float  # [1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
-        """Return the identified constants of a motor and their 95 % intervals, as (value, low, high, unit) by name."""
+        """Return a motor's identified constants by name, each as (value, low, high, unit) with its 95 % interval."""
         return {name: (value, *self.intervals[name], PRIORS[name][1]) for name, value in self.constants.items()}
 
     def to_json(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ COMPARABLE = 10.0
 
 @dataclass(frozen=True)
 class FitTest:
-    """One-sided χ² test of one motion: of the residuals of a channel or of all channels, or of the parameters."""
+    """Result of a one-sided χ² test of a motion: of its residuals, or of the parameters that a sensor calls for."""
 
     motion: str
     channel: str  # empty: all channels of the motion; "parameters by ...": of a sensor, compared with all others
@@ -33,12 +33,12 @@ class FitTest:
 
     @property
     def passed(self) -> bool:
-        """Whether χ² is at most the limit."""
+        """Whether the test does not reject the fit: χ² is at most its limit."""
         return self.chi2 <= self.limit
 
 
 def chi2_limit(count: int, fitted: float, correlation: float, level: float) -> float:
-    """Return the χ² that a right model exceeds with probability `level`.
+    """Return the mean square of residuals (χ²) that a right model exceeds with probability `level`.
 
     χ² is the mean square of `count` normal residuals of variance 1, of which the fit determines `fitted` (trace of the
     hat matrix). Correlated residuals act like count / correlation independent ones.
@@ -68,7 +68,7 @@ class Sensor(NamedTuple):
 
 
 def sensor_columns(motion: MotionResiduals) -> dict[str, list[int]]:
-    """Return the measurement columns of each sensor of a motion that measures anything, by its name."""
+    """Return which columns of a motion's measurements belong to each sensor, by its name."""
     columns: dict[str, list[int]] = {}
     for name, span in motion.channels:
         indices = range(*span.indices(motion.valid.shape[1]))
@@ -80,7 +80,7 @@ def sensor_columns(motion: MotionResiduals) -> dict[str, list[int]]:
 
 
 def sensors(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
-    """Return the sensors of all motions that measure anything; normal: normal equations."""
+    """Return the sensors of all motions, each with the parameters that its data call for; normal: normal equations."""
     result = []
     for i, motion in enumerate(problem.motions):
         column_of = np.nonzero(motion.valid)[1]
@@ -90,7 +90,7 @@ def sensors(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
 
 
 def test_level(problem: LeastSquares) -> float:
-    """Return the level of each test of a fit, for the family-wise level `FAMILY_LEVEL` (Šidák)."""
+    """Return the false-alarm probability of each single test of a fit, for `FAMILY_LEVEL` over all tests (Šidák)."""
     count = len(problem.motions) + sum(len(sensor_columns(motion)) for motion in problem.motions)
     count += sum(motion.valid[:, span].any() for motion in problem.motions for _, span in motion.channels)
     return -math.expm1(math.log1p(-FAMILY_LEVEL) / count)
@@ -99,7 +99,7 @@ def test_level(problem: LeastSquares) -> float:
 def parameter_tests(
     problem: LeastSquares, normal: NormalEquations, mismatch: float = 1.0
 ) -> list[tuple[Sensor, FitTest]]:
-    """Test for each sensor whether all others call for the same parameters: score tests (Rao 1948).
+    """Test for each sensor whether its data agree with the parameters that all others call for (Rao's score test).
 
     At the fit the scores of all sensors and the prior cancel. The score of a sensor with information I has the
     covariance I - I C I, where C is the covariance of the parameters. Combinations of parameters below `COMPARABLE` are
@@ -121,7 +121,7 @@ def parameter_tests(
 
 
 def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
-    """Return the sensors that call for other parameters than the fit, those of motions on the ground first.
+    """Return the sensors whose data contradict the fitted parameters, those of motions on the ground first.
 
     Only their contacts make local minima. Of each kind, the sensor that contradicts the others most is first. normal:
     normal equations at the fit.
@@ -132,7 +132,7 @@ def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Senso
 
 
 def without(normal: NormalEquations, sensor: Sensor) -> np.ndarray:
-    """Return the change of the parameters (P,) if a sensor were left out of a fit, to first order."""
+    """Return the change of the fitted parameters (P,) if a sensor were left out of the fit, to first order."""
     return np.linalg.solve(normal.information() + np.eye(len(sensor.score)) - sensor.information, sensor.score)
 
 

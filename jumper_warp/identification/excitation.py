@@ -61,10 +61,10 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
 
 
 class Scorer:
-    """Scorer of candidate motions by their Fisher information about the robot's parameters, from simulation."""
+    """Scorer of candidate motions, by the Fisher information of their simulated recordings about the parameters."""
 
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
-        """Score motions for `parameters` and sensor `noise`; replay: simulation, by default of the described robot."""
+        """Prepare to rate motions by what they reveal about `parameters` under sensor `noise`; replay: simulation."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
         self.replay = replay or MotionReplay()
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))

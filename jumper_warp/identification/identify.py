@@ -141,7 +141,7 @@ def identify_by_evolution(
 
 
 class Descent:
-    """Levenberg-Marquardt optimisation in stages (`minimise`), with a log of its steps, time and physics steps."""
+    """Levenberg-Marquardt optimisation of a robot's parameters in stages, with a log of its steps and effort."""
 
     def __init__(self, replay: MotionReplay, advance: Callable[[], object] = lambda: None):
         """Start the clocks and an empty log of the optimisation at stage 0.
@@ -262,7 +262,7 @@ def descend(
 
 
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
-    """Sample a displacement (P,) of a start from a minimum with the normal equations `normal`."""
+    """Return a random change (P,) of the parameters that moves a start away from a minimum with equations `normal`."""
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
     move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
     return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)
@@ -299,7 +299,7 @@ def add_motions(
 
 
 def misfit(motion: MotionResiduals, replay: MotionReplay, z: np.ndarray) -> float:
-    """Return the misfit of a motion at parameters z (P,) and nominal initial state: mean ln(1 + residual^2)."""
+    """Return how badly a motion fits parameters z (P,) at the nominal initial state: mean ln(1 + residual^2)."""
     residuals = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
     with np.errstate(over="ignore"):
         return float(np.mean(np.log1p(np.nan_to_num(residuals, posinf=1.0e100) ** 2)))

@@ -40,7 +40,7 @@ class InitialStates:
 
 
 class InitialStatePrior:
-    """Prior distribution of a motion's initial state, estimated from its first measured rows.
+    """Prior distribution of the robot's state at the start of a motion, estimated from its first measured rows.
 
     The state has I = 27 or 36 normalised coordinates. Coordinates are deviations from the measured state, in prior
     standard deviations: 12 motor readings, 12 rates, the base's rotation vector (3), and for a free base its position,
@@ -123,7 +123,7 @@ def motors_at_rest(rate: np.ndarray | None) -> bool:
 def first_values(
     values: np.ndarray | None, default: np.ndarray, measured_std: float, default_std: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first measured value of each column and its standard deviation, or a default without measurement.
+    """Return the first measured value of each column and its standard deviation, or defaults where nothing is measured.
 
     (columns,) each. values: (n, columns), NaN where not measured, or None; only the first `FIRST_ROWS` count. default:
     (columns,).

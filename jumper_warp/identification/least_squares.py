@@ -27,7 +27,7 @@ LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviat
 
 @dataclass
 class Point:
-    """Parameters and initial states of all motions at one iterate of the optimisation, normalised by their priors."""
+    """Values of the unknowns in one optimisation step: parameters and initial states, normalised by their priors."""
 
     z: np.ndarray  # (P,) parameters
     starts: list[np.ndarray]  # by motion: (I,) coordinates of the initial state
@@ -52,7 +52,7 @@ class NormalEquations:
     weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 
     def of_rows(self, index: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Fisher information (P, P) and the score (P,) of some residuals of a motion, (m,) bool `rows`.
+        """Return Fisher information (P, P) and score (P,) that a part of a motion's residuals has, (m,) bool `rows`.
 
         About the normalised parameters, while the motion's initial state follows them. The score is the gradient of
         half the residuals' cost. index: of the motion.
@@ -66,7 +66,7 @@ class NormalEquations:
         return 0.5 * (information + information.T), score
 
     def following(self, starts: Sequence[np.ndarray], moves: np.ndarray) -> list[np.ndarray]:
-        """Return the initial states (K, I) by motion that follow moves of the parameters (K, P) to first order.
+        """Return the initial states (K, I), by motion, that fit best after changes of the parameters (K, P).
 
         starts: (I,) by motion, before the moves.
         """
@@ -120,7 +120,7 @@ def transposed_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 class Trial(NamedTuple):
-    """Result of a Levenberg-Marquardt step."""
+    """Result of one attempted Levenberg-Marquardt step."""
 
     point: Point  # after the step
     cost: float  # at the point
@@ -130,7 +130,7 @@ class Trial(NamedTuple):
 
 
 def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.ndarray]) -> list[Linearised]:
-    """Replace the residuals of linearised motions, (m,) by motion, and keep their Jacobians."""
+    """Return linearised motions with other residuals, (m,) by motion, and the same Jacobians."""
     return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, linearised, strict=True)]
 
 
@@ -154,11 +154,11 @@ class LeastSquares:
         self._change = [np.full(len(parameters) + motion.start_size, DIFFERENCE) for motion in motions]
 
     def scale(self, normal: NormalEquations) -> float:
-        """Return the mean squared residual, at least 1: the change of the cost by one standard deviation."""
+        """Return the unit in which costs are compared: the mean squared residual of a fit, at least 1."""
         return max(1.0, normal.data_cost / self.count)
 
     def nominal_point(self) -> Point:
-        """Return the point where all unknowns have the mean of their prior."""
+        """Return the point at which each unknown has the mean of its prior."""
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
 
     def normal(self, point: Point, known: Sequence[Linearised] = ()) -> NormalEquations:
@@ -224,7 +224,7 @@ class LeastSquares:
         return normal
 
     def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
-        """Return the point of least cost when one parameter moves and all other unknowns follow to first order.
+        """Return the best point for several values of one parameter, when all other unknowns follow to first order.
 
         With its cost. index: of the parameter; moves: changes of its z, (K,).
         """
@@ -295,7 +295,7 @@ class LeastSquares:
         return np.where(np.isfinite(cost), cost, math.inf), residuals
 
     def step(self, point: Point, normal: NormalEquations, geodesic: bool = True) -> Trial:
-        """Take the best Levenberg-Marquardt step over all `DAMPINGS`; the point stays if no step lowers the cost.
+        """Take the best Levenberg-Marquardt step over all damping values; without a lower cost the point stays.
 
         geodesic: also try each step with geodesic acceleration, which follows the curvature of the residuals.
         """

@@ -115,7 +115,7 @@ class RecordedMotion:
         self._check_settings()
 
     def _check_settings(self) -> None:
-        """Raise InputError if quaternions are not of length 1, nothing is measured, or a setting is out of range."""
+        """Raise InputError if nothing is measured, quaternions are not of length 1, or a setting is out of range."""
         where = f"motion {self.name}"
         if self.quaternion is not None:
             size = np.linalg.norm(self.quaternion, axis=1)
@@ -299,7 +299,7 @@ def sidecar_settings(path: Path) -> dict[str, Any]:
 
 
 def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np.ndarray]:
-    """Sort the columns of a recorded table into arrays by measured channel, in SI units.
+    """Convert the columns of a recorded table to arrays by measured channel, in SI units.
 
     Arrays: (n,) for time, else (n, 3, 4 or 12); unmeasured columns are NaN. names: of the columns, such as
     `angle/FL_outer [deg]`. table: (n, columns). Raises InputError: an unknown name or unit, a column twice, or time or

@@ -22,7 +22,7 @@ BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 
 @dataclass(frozen=True)
 class Parameter:
-    """Unknown parameter of the robot with prior and bounds.
+    """Unknown parameter of the robot that an identification estimates, with prior and bounds.
 
     It is one value that is written to some columns of a quantity of `RobotValues`. The optimiser works on z = (value -
     nominal) / prior, or for a ratio on z = ln(value / nominal) / prior; the prior of z is a normal distribution of mean
@@ -56,7 +56,7 @@ class Parameter:
 
     @property
     def z_per_growth(self) -> float:
-        """Derivative of the normalised coordinate z by the relative change of the value, at the nominal value."""
+        """Change of the normalised coordinate z per relative change of the parameter's value, at the nominal value."""
         return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
 
     def value(self, z: np.ndarray) -> np.ndarray:
@@ -115,7 +115,7 @@ class ParameterSet:
         return np.stack([p.normalised(values[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
-        """Return N robots whose parameters have normalised coordinates z (N, P); other values are the description's."""
+        """Return N robots with the parameter values of normalised coordinates z (N, P), otherwise as described."""
         z = np.atleast_2d(z)
         robots, values = RobotValues.nominal(len(z), description), self.values(z)
         for i, parameter in enumerate(self.parameters):
@@ -123,7 +123,7 @@ class ParameterSet:
         return robots
 
     def without(self, names: Iterable[str]) -> ParameterSet:
-        """Return the parameter set without the parameters whose name, group or quantity is in `names`.
+        """Return a copy without the parameters whose name, group or quantity is in `names`.
 
         Raises InputError: a name that is none of these.
         """
@@ -172,7 +172,7 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
 def ratio(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter whose ratio to its nominal value has a lognormal prior.
+    """Return an unknown positive parameter: the logarithm of its ratio to the nominal value has a normal prior.
 
     prior: std [1] of ln(value / nominal); bounds: 5 std, at most tenfold.
     """
@@ -183,7 +183,7 @@ def ratio(
 def relative(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter whose ratio to its nominal value has a normal prior.
+    """Return an unknown positive parameter: its ratio to the nominal value has a normal prior.
 
     prior: std [1] of value / nominal; bounds: 5 std, at least a tenth. Equations of motion are linear in masses, gains
     and armature: combinations that the motions do not determine lie along straight lines of z, which steps of the

@@ -100,7 +100,7 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
-    """Return a planned motion's initial state, at rest in the pose of the first targets; if free, 1 mm in the air."""
+    """Return the state in which a planned motion begins: at rest in the first targets' pose; if free, 1 mm up."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":
@@ -203,7 +203,7 @@ def measure(
     torque: bool = False,
     base_every: int = 2,
 ) -> RecordedMotion:
-    """Turn a simulated motion into a recording with sensor offsets and noise.
+    """Turn a simulated motion into a recording as sensors would give it, with their offsets and noise.
 
     Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion of world 0;
     robots: its sensor offsets. rng: random numbers of the noise, None for no noise. noise: its standard deviations.

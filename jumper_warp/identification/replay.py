@@ -26,7 +26,7 @@ TOLERANCE = 1.0e-10  # [m/s] tolerance of the contact iteration, whose error fin
 
 @dataclass
 class Record:
-    """True motions of N robots during a replay, R rows, without sensor errors; motors by leg FL, FR, BL, BR."""
+    """True motions (without sensor errors) of N robots in a replay, R rows; motors by leg FL, FR, BL, BR."""
 
     angle: np.ndarray  # (R, 12, N) [rad] motor angles; of each leg lateral, outer, inner
     rate: np.ndarray  # (R, 12, N) [rad/s] motor rates
@@ -37,7 +37,7 @@ class Record:
 
 
 class MotionReplay:
-    """Simulation of recorded motor targets in parallel worlds; caches a `Rollout` by worlds and physics step."""
+    """Simulation of robots that follow recorded motor targets, in parallel worlds; keeps each `Rollout` for reuse."""
 
     def __init__(
         self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
@@ -129,7 +129,7 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 
 
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
-    """Return the kernels' table of masses, joints and friction (321, N) of N robots.
+    """Return masses, joints and friction of N robots as the table that the kernels read, (321, N).
 
     Rows as in `kernels.layout`; nominal: as described, (321, 1).
     """

@@ -153,7 +153,7 @@ def write_html(result: Identification, folder: Path) -> None:
 
 
 def summary(result: Identification) -> str:
-    """Return the first HTML paragraphs of the identification report: counts, χ², effort and warnings."""
+    """Return the paragraphs at the top of the HTML report: counts, χ², effort and warnings."""
     text = (
         f"{int(result.identified.sum())} of {len(result.parameters)} parameters are identified from {result.count} "
         f"measured values. Mean squared weighed residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). "
@@ -171,7 +171,7 @@ def summary(result: Identification) -> str:
 
 
 def starts_line(result: Identification) -> str:
-    """Return one line on whether the starts of the optimisation agree."""
+    """Return one line of text on whether the starts of the optimisation found the same result."""
     if result.starts_agree is None:
         return "one start"
     others = ", ".join(
@@ -211,7 +211,7 @@ def parameter_table(result: Identification) -> str:
 
 
 def fit_table(result: Identification) -> str:
-    """Return the HTML table of the fit: χ², its limit and rms error of each motion and channel; failed other tests."""
+    """Return the HTML table of how well each motion and channel fits (χ², its limit, rms error) and of failed tests."""
     rows, fits = [], {(fit.motion, fit.channel): fit for fit in result.fits}
     for test in result.tests:
         cells = (f"{test.chi2:.3f}", f"{test.limit:.3f}", "yes" if test.passed else "no")
@@ -301,6 +301,6 @@ def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarr
 
 
 def shown_channels(channels: Sequence[tuple[str, slice]]) -> list[tuple[str, slice]]:
-    """Choose the measured channels (name, columns) whose residuals are plotted: the first three in report order."""
+    """Choose up to three measured channels (name, columns) whose residuals the report plots."""
     order = {name: i for i, name in enumerate(("angle", "rate", "torque", "position", "orientation"))}
     return sorted(channels, key=lambda channel: order[channel[0]])[:3]

@@ -127,7 +127,7 @@ class MotionResiduals:
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def first_part(self, fraction: float) -> MotionResiduals:
-        """Return the residuals of the first `fraction` (0 to 1) of the motion's rows, with the same initial prior."""
+        """Return residuals that compare only the first `fraction` (0 to 1) of the motion's rows, same initial prior."""
         if fraction >= 1.0:
             return self
         part = copy.copy(self)
@@ -213,7 +213,7 @@ class MotionResiduals:
         return np.concatenate(columns, axis=1)
 
     def _plan_jacobian(self) -> list[list[tuple[int, int | None]]]:
-        """Distribute the unknowns of the Jacobian's finite differences over parallel worlds.
+        """Assign each unknown that a finite difference perturbs to one of the parallel worlds.
 
         Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
         unknown of the four legs shares a world.
@@ -274,7 +274,7 @@ def check_signs(motion: RecordedMotion) -> None:
 
 
 def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
-    """Return a motion with the rows `first` to `end` - 1 of another."""
+    """Return the part of a recorded motion from row `first` to row `end` - 1."""
     if (first, end) == (0, len(motion.time)):
         return motion
     return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})
@@ -287,7 +287,7 @@ def pieces_of(
     description: RobotDescription,
     dt: float | None,
 ) -> list[MotionResiduals]:
-    """Cut a motion into consecutive pieces about `PIECE` long, and return their residuals.
+    """Cut a motion into consecutive pieces about `PIECE` [s] long, and return the residuals of each.
 
     Unmeasured pieces are left out. dt [s]: as in `MotionResiduals`.
     """
@@ -304,7 +304,7 @@ def pieces_of(
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
-    """Divide the time between two rows into physics steps of at most dt.
+    """Divide the time between two recorded rows into equal physics steps of at most dt.
 
     Returns (number of steps in a period [s], step [s]); dt: by default 1/480 s. Raises InputError: dt outside 1e-6 to
     0.01 s.

@@ -38,7 +38,7 @@ class DescentStep:
 
 
 class Effort(NamedTuple):
-    """Computing effort of an optimisation."""
+    """Computing time and physics steps that an optimisation took."""
 
     seconds: float  # [s] wall time
     cpu_seconds: float  # [s] CPU time of all threads
@@ -47,7 +47,7 @@ class Effort(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of measurement and simulation in one measured channel of one motion."""
+    """Measures of how well the simulation fits the measurements in one channel of one motion."""
 
     motion: str
     channel: str
@@ -65,7 +65,7 @@ class Minimum(NamedTuple):
 
 @dataclass(frozen=True)
 class Start:
-    """Result of one start of the optimisation, compared with the best one."""
+    """Comparison of one start of the optimisation with the best start, by cost and parameters."""
 
     excess: float  # [1] Cost above that of the best start, over χ² if that is above 1
     difference: float
@@ -73,13 +73,13 @@ class Start:
 
 
 def excess_costs(problem: LeastSquares, minima: Sequence[Minimum]) -> np.ndarray:
-    """Return the costs of minima (K,) above that of the first, the best, over its χ² if that is above 1."""
+    """Return by how much the cost of each minimum (K,) exceeds the first, best one's, over its χ² if above 1."""
     costs = np.array([minimum.normal.cost for minimum in minima])
     return (costs - costs[0]) / problem.scale(minima[0].normal) if minima else costs
 
 
 def starts_agree(excess: Sequence[float] | np.ndarray) -> bool:
-    """Return whether a second start confirms the best, the first: a cost that is higher by less than `SAME_COST`."""
+    """Return whether the second-best start confirms the best: its cost is higher by less than `SAME_COST`."""
     return len(excess) > 1 and excess[1] < SAME_COST
 
 
@@ -198,7 +198,7 @@ class ChannelError(NamedTuple):
 
 
 def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
-    """Return the differences between measurement and simulation at a point, by motion and measured channel."""
+    """Return how far simulation and measurement differ at a point, for each motion and measured channel."""
     errors = []
     for motion, start in zip(problem.motions, point.starts, strict=True):
         table = np.full(motion.valid.shape, math.nan)
@@ -214,7 +214,7 @@ def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
 def summarise(
     problem: LeastSquares, minima: Sequence[Minimum], steps: Sequence[DescentStep], effort: Callable[[], Effort]
 ) -> Identification:
-    """Summarise an identification: estimate, uncertainty and fit.
+    """Collect the results of an identification from its minima: estimate, uncertainty and fit.
 
     minima: of all starts, best first. steps: log of the optimisation. effort: called after all evaluations.
     """

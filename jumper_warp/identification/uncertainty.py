@@ -49,7 +49,7 @@ class Direction:
 
 
 def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
-    """Return the factor [1] by which errors of the model widen intervals that assume noise alone, at least 1.
+    """Return the factor [1], at least 1, by which model errors widen intervals that are computed from noise alone.
 
     tables: residuals of each motion over their noise, (n rows, columns), NaN where nothing is measured. Residuals with
     mean square chi2 and correlation time tau [rows] carry 1 / (chi2 tau) of the information of white noise.
@@ -160,7 +160,7 @@ def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
 
 
 def largest_members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
-    """Name the parameters of a quantity that dominate an undetermined combination, up to four, as ` (FL_outer, ...)`.
+    """Return as text which parameters of a quantity, up to four, dominate an undetermined combination.
 
     vector: (P,). Empty if the quantity has only one parameter or all its components are below 0.3.
     """

@@ -14,7 +14,7 @@ from jumper_warp.robot.parts import Joint, Link, Motor, RobotDescription, RobotD
 
 
 class Range(NamedTuple):
-    """Range of plausible values of a quantity, closed interval [low, high]."""
+    """Closed interval [low, high] of values that are plausible for a quantity."""
 
     low: float  # in the unit
     high: float  # in the unit
@@ -127,7 +127,7 @@ def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
 
 
 def shape_corners(shape: Shape) -> np.ndarray:
-    """Return the corners (8, 3) [m] of a shape's bounding box, in the link frame; the box is along the shape's axes."""
+    """Return the corners (8, 3) [m], in the link frame, of the box around a shape, along the shape's own axes."""
     if shape.mesh is not None:
         low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
     else:

@@ -144,7 +144,7 @@ def check_loops(description: RobotDescription) -> None:
 
 
 def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
-    """Return whether arrays agree: every entry of `actual` within `tolerance` of `expected`; the shapes broadcast."""
+    """Return whether two arrays are equal within `tolerance` in every entry; their shapes broadcast."""
     return bool(np.abs(np.asarray(actual) - expected).max() <= tolerance)
 
 

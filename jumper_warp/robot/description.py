@@ -77,7 +77,7 @@ _cached_description = functools.cache(_read_description)
 
 
 class JsonReader:
-    """Reader of a description's JSON file. Every method raises RobotDescriptionError on bad input.
+    """Reader of a robot description's JSON file. Every method raises RobotDescriptionError on bad input.
 
     Parameters: table, a JSON object; key, its entry; part, the place that an error message names ("" for the root).
     """
@@ -136,7 +136,7 @@ class JsonReader:
         return tuple(motors)
 
     def table_of(self, noun: str, names: Sequence[str]) -> dict:
-        """Return the JSON object of motors or loops by name (noun: singular); refuse names that are not in `names`."""
+        """Return the JSON object that lists motors or loops (noun: singular); refuse names that are not in `names`."""
         table = self.get(self.root, f"{noun}s", "", dict)
         for name in table:
             self.require(name in names, f"{noun} {name}", f"expected one of {', '.join(names)}")

@@ -49,7 +49,7 @@ class BlockCfg:
             raise InputError(f"block center must be finite, got {self.center}")
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
-        """Return the block's properties of every world as arrays by name.
+        """Return position, size, mass and friction of the block in each world, as arrays by name.
 
         `center`, `half` (num_worlds, 2) [m], the others (num_worlds,). Raises InputError for arrays of another number
         of worlds.
@@ -107,7 +107,7 @@ def uneven(
 
 
 def _nodes(size: float, cell: float) -> np.ndarray:
-    """Return the grid coordinates of a heightfield along an axis [m], from -size/2 to size/2, at most `cell` apart."""
+    """Return coordinates of a square ground's grid along one axis [m], -size/2 to size/2, at most `cell` apart."""
     if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
         raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
@@ -125,7 +125,7 @@ def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: f
 
 
 def _heightfield(heights: np.ndarray, size: float) -> newton.Heightfield:
-    """Return a square heightfield of edge `size` [m]; heights: (n, n) [m], rows along y, columns along x."""
+    """Return a Newton heightfield of square ground, edge `size` [m], from heights (n, n) [m], rows along y."""
     import newton
 
     rows, cols = heights.shape

@@ -57,7 +57,7 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
 
 
 def add(parent: Element, tag: str, **attributes: Any) -> Element:
-    """Add a child element to an XML element and return it.
+    """Add a child element with a tag and attributes to an XML element, and return the child.
 
     Numbers and lists of numbers become text, attributes of None are left out.
     """
@@ -66,7 +66,7 @@ def add(parent: Element, tag: str, **attributes: Any) -> Element:
 
 
 def _text(value: Any) -> str:
-    """Return an XML attribute's value as text; numbers have twelve digits."""
+    """Return the value of an XML attribute as text, numbers with twelve digits."""
     if isinstance(value, str):
         return value
     if isinstance(value, Iterable):

@@ -153,7 +153,7 @@ class LimitsCfg:
     """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError as `check_angle_limits`."""
+        """Raise InputError unless the limits are finite, lower < upper, and their hard zones do not overlap."""
         check_angle_limits("angle", **vars(self))
 
 
@@ -171,7 +171,7 @@ class FilterCfg:
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError as `check_filter_speed`."""
+        """Raise InputError if horizon or speed floor is out of its range."""
         check_filter_speed(self.horizon, self.speed_floor)
 
 

@@ -92,7 +92,7 @@ class RobotOverlay:
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of the robot (N = 1); those that the overlay does not replace come from the description."""
+        """Return all values of the overlay's robot (N = 1); values that it lacks come from the description."""
         robot = RobotValues.nominal(1, description)
         for name, values in self.values.items():
             getattr(robot, name)[0] = values
@@ -181,6 +181,6 @@ def load_overlay(path: Path) -> RobotOverlay:
 
 
 def overlay_of(values: RobotValues, quantities: tuple[str, ...], **fields: Any) -> RobotOverlay:
-    """Return an overlay with some quantities of the first robot in `values`; fields: others of `RobotOverlay`."""
+    """Return an overlay with some quantities of the first robot in `values`; fields: other fields of the overlay."""
     selected = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
     return RobotOverlay(selected, **fields)

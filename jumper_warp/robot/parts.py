@@ -33,7 +33,7 @@ def description_error(message: str) -> RobotDescriptionError:
 
 
 def require(holds: bool, file: Path, part: str, problem: str) -> None:
-    """Raise RobotDescriptionError, which names a file and a part of it, unless `holds`."""
+    """Raise RobotDescriptionError with a message that names file and part, unless `holds` is true."""
     if not holds:
         raise RobotDescriptionError(file, part, problem)
 
@@ -99,7 +99,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of a motor's position control."""
+    """Proportional and derivative gain of a motor's position control."""
 
     kp: float  # [N m/rad]
     kd: float  # [N m s/rad]

@@ -125,7 +125,7 @@ def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.G
 
 
 class _Tile(NamedTuple):
-    """One terrain tile, whose methods return the heights of its nodes for each kind of ground."""
+    """Terrain tile under construction: methods return the heights of its grid nodes, one method per kind of ground."""
 
     cfg: TerrainCfg
     difficulty: float  # 0 to 1
@@ -157,7 +157,7 @@ class _Tile(NamedTuple):
         return self.step * np.floor(self._inward() / 0.6 + 1.0e-6)
 
     def _inward(self) -> np.ndarray:
-        """Return the distance of each node from the rim, (n, n) [m], clipped to the distance of the level middle."""
+        """Return how far inside the rim each node is, (n, n) [m], at most as far as the level middle begins."""
         return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
 
     def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:

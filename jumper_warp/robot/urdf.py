@@ -76,7 +76,7 @@ class UrdfReader:
         return tuple(self.joint(element) for element in self.named("joint"))
 
     def named(self, tag: str) -> list[Element]:
-        """Return the root's XML elements with a tag, such as all links; refuse missing or repeated names."""
+        """Return the URDF's XML elements with a tag, such as all links; refuse missing or repeated names."""
         elements = self.root.findall(tag)
         for name, count in Counter(element.get("name") for element in elements).items():
             self.require(bool(name), tag, "expected a name")

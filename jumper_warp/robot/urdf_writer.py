@@ -27,7 +27,7 @@ def urdf(robot: RobotDescription) -> str:
 
 
 def _child(element: Element, tag: str) -> Element:
-    """Return the child of an XML element with a tag, in a checked URDF."""
+    """Return the first element with a tag inside an XML element of a checked URDF."""
     return next(element.iter(tag))
 
 
@@ -66,5 +66,5 @@ def loop_closures(robot: RobotDescription, pose: dict[str, float]) -> str:
 
 
 def _numbers(values: np.ndarray) -> str:
-    """Return numbers as a YAML list."""
+    """Return an array of numbers as the text of a YAML list."""
     return f"[{', '.join(f'{float(value):.12g}' for value in values)}]"

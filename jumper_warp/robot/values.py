@@ -97,7 +97,7 @@ def described(values: RobotValues, description: RobotDescription) -> RobotDescri
 
 
 def _described_motor(motor: Motor, value: Mapping[str, float]) -> Motor:
-    """Return a motor type with one robot's armature, friction, gains and speeds; value: by `MOTOR_QUANTITIES`."""
+    """Return a copy of a motor type with one robot's armature, friction, gains and speeds, by `MOTOR_QUANTITIES`."""
     jumping, walking = (Gains(value["kp"] * pd.kp, value["kd"] * pd.kd) for pd in (motor.jumping, motor.walking))
     return replace(
         motor,

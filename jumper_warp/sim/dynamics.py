@@ -69,7 +69,7 @@ def kernel_modules(double: bool = False) -> KernelModules:
 def advance_kernel(
     device: wp.Device, modules: KernelModules | None = None, by_legs: bool | None = None
 ) -> tuple[wp.Kernel, int]:
-    """Return the kernel that advances the physics, and its threads per block.
+    """Return the kernel that advances the physics, and its number of threads per block.
 
     modules: default in single precision; by_legs: as in `JumperDynamics.advance`.
     """
@@ -255,7 +255,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Allocate the record of the time steps that a reverse pass recomputes, all zero."""
+        """Allocate the arrays in which a reverse pass records the time steps that it recomputes, all zero."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -264,7 +264,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Copy masses, joints, friction, gravity and knee springs of all worlds to the parameter table."""
+        """Copy masses, joints, friction, gravity and knee springs from the model to the kernels' parameter table."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -297,7 +297,7 @@ class JumperDynamics:
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
-        """Update masses, armature and friction in the kernels' parameter table from the model, in some worlds.
+        """Update masses, armature and friction of some worlds in the kernels' parameter table, from the model.
 
         mask: (num_worlds,) float, not 0 in worlds to update. worlds: range in which the mask is read, by default all.
         """
@@ -318,7 +318,7 @@ class JumperDynamics:
         self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
-        """Launch a kernel that writes to the table of robot parameters, (PARAMETER_ROWS, num_worlds)."""
+        """Launch a kernel that writes to the table of robot parameters."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
     def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
@@ -335,7 +335,7 @@ class JumperDynamics:
         self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None,
         previous: wp.array | None = None, delay: wp.array | None = None,
     ) -> Any:  # fmt: skip
-        """Return the inputs of a physics launch as a struct: joint forces, wrench on the base, and motor targets.
+        """Return the inputs that drive the robots in a launch, a struct: joint forces, base wrench, motor targets.
 
         The struct is the kernels' `Drive`. joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in
         Newton. With motors (`MotorArrays`) they follow target [rad], (12, num_worlds); with delay [physics steps],
@@ -350,7 +350,7 @@ class JumperDynamics:
         return drive
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that advances the physics, and its threads per block. by_legs: see `advance`."""
+        """Return the kernel that advances the physics, and its number of threads per block. by_legs: see `advance`."""
         return advance_kernel(self.device, self.modules, by_legs)
 
     def advance(
@@ -371,7 +371,7 @@ class JumperDynamics:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def momenta(self) -> Any:
-        """Allocate the linear and angular momentum of every robot, all zero.
+        """Allocate arrays for the linear and angular momentum of every robot, all zero.
 
         Returned as the kernels' `Momenta`: `lin` [kg m/s] and `ang` [kg m^2/s], vec3 of shape (num_worlds,).
         """
@@ -392,7 +392,7 @@ class JumperDynamics:
     def project_momentum(
         self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: WorldRange | None = None
     ) -> None:
-        """Correct the base's velocity in qd, so that gravity alone changes the momentum of a robot in free flight.
+        """Correct the base's velocity in qd so that only gravity changes the momentum of a robot in free flight.
 
         Call it after `advance` by `time` [s]. momenta: before that call. body_f: wrenches during it; a robot with a
         contact or a wrench on its base stays uncorrected. worlds: range, by default all.

@@ -35,7 +35,7 @@ RANDOMIZED_FLAGS = (
 
 
 class Physics(ABC):
-    """Interface of the solver and motors that advance all worlds of a `Simulation`.
+    """Interface of the solver and motors with which a `Simulation` advances its worlds.
 
     Arrays are never reallocated; legs FL, FR, BL, BR.
     """
@@ -79,7 +79,7 @@ class Physics(ABC):
 
     @abstractmethod
     def forget(self, mask: wp.array) -> None:
-        """Clear warm starts, contact history and diverged flags where mask (num_worlds + 1,) bool is set."""
+        """Clear warm starts, contact history and divergence of worlds whose mask (num_worlds + 1,) bool is set."""
 
     @abstractmethod
     def after_reset(self, mask: wp.array) -> None:
@@ -98,7 +98,7 @@ class Physics(ABC):
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the arrays that a snapshot must save beside joint_q, joint_qd and `impulse`, by name; not copies.
+        """Return by name the arrays that the next step depends on beside joint_q, joint_qd and `impulse`; not copies.
 
         The next step depends on them, for example on a warm start of the solver. A solver without memory has none.
         """
@@ -125,7 +125,7 @@ class JumperPhysics(Physics):
         self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
         bodies: bool = True, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
-        """Launch `substeps` physics steps of SolverJumper; see `Physics.advance`."""
+        """Launch `substeps` physics steps of SolverJumper, with motors that follow target [rad], (12, num_worlds)."""
         state, sim = self._sim.state, self._sim
         q, qd, momenta = state.joint_q, state.joint_qd, self._momenta
         if momenta is not None:

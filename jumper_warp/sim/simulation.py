@@ -185,7 +185,7 @@ class Simulation:
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
-        """Copy the mask of the worlds to reset to the device.
+        """Copy the mask of the worlds that are to be reset to the device.
 
         mask: bool of shape (num_worlds,); None: all True. Raises InputError.
         """
@@ -220,12 +220,12 @@ class Simulation:
         self._captured("physics", lambda worlds: self._physics(1, worlds))
 
     def _step(self, worlds: WorldRange) -> None:
-        """Launch one policy step of a range of worlds."""
+        """Launch one policy step (command filter and physics) of a range of worlds."""
         self._filter_targets(worlds)
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run a sequence of kernel launches for all worlds, captured as a graph from the second call of a name on.
+        """Run kernel launches for all worlds; from the second call of a name on they are replayed as a captured graph.
 
         body: launches them for a range of worlds. Within a capture it is called directly.
         """

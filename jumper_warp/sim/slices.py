@@ -38,7 +38,7 @@ def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
 
 @functools.cache
 def _capture_stream(device: str) -> wp.Stream:
-    """Return the CUDA stream of a device that is used for captures alone; device: torch's name of the device.
+    """Return the CUDA stream on which only captures of graphs run; device: torch's name of the device.
 
     It is a stream of torch, since other threads may not use the default stream while a stream of Warp is captured.
     """
@@ -48,12 +48,12 @@ def _capture_stream(device: str) -> wp.Stream:
 
 
 def _on_capture_stream(device: wp.Device) -> AbstractContextManager[Any]:
-    """Return a context for a capture on a stream of its own, so that work of other threads stays out of the graph."""
+    """Return a context in which a device captures a graph on a stream that no other thread's work uses."""
     return wp.ScopedStream(_capture_stream(wp.device_to_torch(device))) if device.is_cuda else nullcontext()
 
 
 class SlicedGraph:
-    """Kernel launches captured as one graph for each slice of worlds, to replay them together."""
+    """Kernel launches that are captured as one graph for each slice of worlds, and replayed together."""
 
     @locked
     def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:

@@ -206,7 +206,7 @@ class SolverJumper(SolverBase):
         return control.joint_f, body_f
 
     def _check(self, name: str, array: wp.array | None, shape: tuple[int, ...]) -> None:
-        """Raise InputError unless an array has this shape and is on the model's device; kernels check neither."""
+        """Raise InputError unless an array has the given shape and is on the model's device; kernels check neither."""
         if array is None or array.shape != shape or array.device is not self.model.device:
             found = "None" if array is None else f"{array.shape} on {array.device}"
             raise InputError(
@@ -220,7 +220,7 @@ class SolverJumper(SolverBase):
             self._check(f"{name}.{field}", getattr(state, field), shape)
 
     def _check_motors(self, motors: Any, **arrays: wp.array | None) -> None:
-        """Raise InputError unless constants of motors, targets and delay, those that are given, fit the worlds."""
+        """Raise InputError unless the given constants of motors, targets and delay fit the number of worlds."""
         n = self.model.world_count
         for name in MOTOR_CONSTANTS:
             self._check(f"motors.{name}", getattr(motors, name), (12, n))
@@ -269,7 +269,7 @@ class SolverJumper(SolverBase):
 
     @locked
     def update_contacts(self, contacts: newton.Contacts, state: State | None = None) -> None:
-        """Write the paws' contacts of the last step: four rows a world, FL, FR, BL, BR, touching or not.
+        """Write the paws' contacts of the last step to `contacts`, touching or not: four rows a world, FL, FR, BL, BR.
 
         Shape 0 is the paw, shape 1 the ground, on which a block counts as ground; without ground there are no rows.
         state: the last step's. `contacts.force`, if allocated, gets the force of the ground on the paw [N], world.
@@ -350,7 +350,7 @@ class SolverJumper(SolverBase):
         return self._blocks().numpy()
 
     def _blocks(self) -> wp.array:
-        """Return the device array of the blocks that the paws can push, (num_worlds,).
+        """Return the device array of the sliding blocks that paws can push, (num_worlds,).
 
         Raises InputError without blocks.
         """

@@ -28,7 +28,7 @@ FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 
 @dataclass
 class Progress:
-    """Best candidate of each start of an optimisation so far, and its history."""
+    """Best candidate so far that an optimisation found from each of its starts, and its history."""
 
     x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
     objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible
@@ -77,7 +77,7 @@ def minimise(
 
 
 class _Descent:
-    """State of the augmented Lagrangian method for all starts in parallel; arguments as in `minimise`."""
+    """State of an optimisation by the augmented Lagrangian method, for all starts in parallel."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
@@ -94,7 +94,7 @@ class _Descent:
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian (starts * repeat,) of candidates, `repeat` consecutive ones by start."""
+        """Return the augmented Lagrangian of candidates, which the descent minimises, (starts * repeat,)."""
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
@@ -139,7 +139,7 @@ class _Descent:
         self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
     def _add_pair(self, gradient: torch.Tensor) -> None:
-        """Store the last step and its change of the gradient for L-BFGS, with 1 / product, 0 if not convex."""
+        """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature."""
         if self.previous is None:
             return
         moved, change = self.x - self.previous[0], gradient - self.previous[1]

@@ -29,7 +29,7 @@ Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
 
 
 class Actor(Protocol):
-    """Policy whose network is optimised, such as `jumper_warp.policies.policy.Policy`."""
+    """Interface of a policy whose network is optimised, such as `jumper_warp.policies.policy.Policy`."""
 
     mean: torch.Tensor  # (num_obs,) of the observations' normaliser
     std: torch.Tensor  # (num_obs,) of the observations' normaliser
@@ -120,7 +120,7 @@ def conjugate_gradients(
 
 
 class Anchor:
-    """Penalty on changes of a network's actions at recorded observations, which forms a trust region."""
+    """Trust region of an optimisation: a penalty on changes of a network's actions at recorded observations."""
 
     def __init__(self, network: Network, obs: torch.Tensor, action_std: torch.Tensor) -> None:
         """Record the network's actions at raw observations obs (m, num_obs) as the original actions.

@@ -67,7 +67,7 @@ def highest() -> Term:
 
 
 def positive_work() -> Term:
-    """Return the objective: the motors' positive work until takeoff (0.25 m/s), in units of 100 J."""
+    """Return the objective of saving energy: the motors' positive work until takeoff (0.25 m/s), in units of 100 J."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         row = motion.takeoff(0.25)[0]
@@ -88,7 +88,7 @@ def pitch_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Term:
-    """Return the constraint: the predicted pitch at the end of `flight` is within ±`limit` [rad].
+    """Return the constraint that the pitch predicted for the landing, at the end of `flight`, is within ±`limit` [rad].
 
     The pitch rate is the angular momentum at takeoff over the pitch inertia of the initial posture.
     """
@@ -103,13 +103,13 @@ def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Te
 
 
 def stays(limit: float, speed: float = 0.25) -> Term:
-    """Return the constraint of a jump on the spot: until takeoff the base moves horizontally by at most `limit` [m]."""
+    """Return the constraint that the base moves horizontally by at most `limit` [m] until takeoff."""
     drift = drifts(limit)
     return lambda motion: torch.where(before_takeoff(motion, speed), drift(motion), 0.0)
 
 
 def leans_back(limit: float, speed: float = 0.25) -> Term:
-    """Return the objective: minus the base's largest distance [m] behind its start before takeoff, up to `limit`."""
+    """Return the objective that rewards moving the base back before takeoff: minus the distance [m], up to `limit`."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         back = motion.q[0, :, 0] - motion.q[..., 0]
@@ -119,7 +119,7 @@ def leans_back(limit: float, speed: float = 0.25) -> Term:
 
 
 def drifts(limit: float) -> Term:
-    """Return the constraint: during the whole motion the base moves horizontally by at most `limit` [m]."""
+    """Return the constraint that the base moves horizontally by at most `limit` [m] during the whole motion."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         offset = motion.q[..., :2] - motion.q[0, :, :2]
@@ -129,7 +129,7 @@ def drifts(limit: float) -> Term:
 
 
 def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
-    """Return the constraint: housings, thighs, knees and shanks clear the ground by `margin` [m], scaled to 0.1 m.
+    """Return the constraint that housings, thighs, knees and shanks are `margin` [m] above ground, scaled to 0.1 m.
 
     speed [m/s]: only the rows before this takeoff count; None: all rows.
     """
@@ -142,7 +142,7 @@ def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
 
 
 def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
-    """Return the constraint: before takeoff hind paws on the ground are at most `limit` [m] ahead of their start."""
+    """Return the constraint that hind paws on the ground are at most `limit` [m] ahead of their start until takeoff."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         hind_x = motion.ankles[..., 2:, 0]  # paws BL, BR
@@ -154,7 +154,7 @@ def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Return the constraint: the robot takes off; else the lowest paw must rise to `lift` [m] at the end of the motion.
+    """Return the constraint that the robot takes off; else the lowest paw must rise to `lift` [m] at the end.
 
     The second condition has a gradient; its value is scaled to 0.1 m and stays above 0.
     """
@@ -168,7 +168,7 @@ def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
 
 
 def upright(limit: float, at_end: bool = True) -> Term:
-    """Return the constraint: the base's tilt is at most `limit` [rad], at the end or (not at_end) at all times."""
+    """Return the constraint that the base tilts by at most `limit` [rad], at the end or (not at_end) at all times."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         quat = motion.q[-1:, :, 3:7] if at_end else motion.q[..., 3:7]
@@ -179,7 +179,7 @@ def upright(limit: float, at_end: bool = True) -> Term:
 
 
 def reaches(height: float) -> Term:
-    """Return the constraint of a high jump: the base's apex, see `highest`, is at least `height` [m]."""
+    """Return the constraint that the base reaches an apex (see `highest`) of at least `height` [m]."""
     return lambda motion: height + highest()(motion)
 
 
@@ -192,7 +192,7 @@ def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
 
 
 def soft(limit: float, speed: float = 0.25) -> Term:
-    """Return the constraint of a soft landing: after takeoff the base accelerates upward by at most `limit` [g].
+    """Return the constraint that the base accelerates upward by at most `limit` [g] after takeoff, for a soft landing.
 
     It is scaled to 10 g. The acceleration is the mean over a policy step.
     """
@@ -207,7 +207,7 @@ def soft(limit: float, speed: float = 0.25) -> Term:
 
 
 def lifted(dead_band: float = 0.001) -> Term:
-    """Return the objective: height of paws that lift again after touchdown, over paws and time, in units of 10 mm s.
+    """Return the objective that penalises paws that lift again after touchdown: height over time, unit 10 mm s.
 
     Heights are counted above `dead_band` [m]. Each paw's height in the last row is added in units of 10 mm.
     """
@@ -221,7 +221,7 @@ def lifted(dead_band: float = 0.001) -> Term:
 
 
 def rest() -> Term:
-    """Return the objective of ending at rest: squared speed [m^2/s^2] + angular velocity [rad^2/s^2] / 10."""
+    """Return the objective of ending at rest: squared final speed [m^2/s^2] + angular velocity [rad^2/s^2] / 10."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         last = motion.qd[-1]

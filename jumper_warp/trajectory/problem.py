@@ -32,7 +32,7 @@ CONTACT_FORCE = 0.1  # [N] force above which a paw is in contact
 
 @dataclass(frozen=True)
 class Knots:
-    """Parametrisation of motor targets: actions within ±1 at knots, linear in between, the last held to the end."""
+    """Description of motor targets over time by few numbers: actions within ±1 at knots, linear in between."""
 
     at: tuple[float, ...]  # Policy steps of the knots, rising from 0
     steps: int  # Policy steps of the motion
@@ -93,7 +93,7 @@ class SimulatedMotion:
         self.num = self.q.shape[1]
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return a quantity of the motion, computed by `make` at the first call with this hashable key, then cached."""
+        """Return the result of `make` for a key, computed at the key's first call and then cached."""
         if key not in self._cache:
             self._cache[key] = make()
         return self._cache[key]
@@ -115,7 +115,7 @@ class SimulatedMotion:
 
     @cached_property
     def down(self) -> torch.Tensor:
-        """Whether each paw is in contact in the last physics step of each policy step, bool (steps, 4, num)."""
+        """Whether each paw is in contact at the end of each policy step, bool (steps, 4, num)."""
         impulse = self.trajectory.impulse.detach()[self.substeps - 1 :: self.substeps]
         return torch.linalg.vector_norm(impulse, dim=-1) > CONTACT_FORCE * self.dt
 
@@ -163,14 +163,14 @@ Term = Callable[[SimulatedMotion], torch.Tensor]
 
 
 class Values(NamedTuple):
-    """Values of objective and constraints for n candidate solutions of a trajectory optimisation problem."""
+    """Objective and constraints of n candidate solutions of a trajectory optimisation problem."""
 
     objective: torch.Tensor  # (n,) to minimise
     constraints: torch.Tensor  # (n, m) satisfied where <= 0
 
 
 class _Worlds(NamedTuple):
-    """Differentiable simulation and initial state of n candidate motions, standing in the default pose."""
+    """Differentiable simulation of n candidate motions, and their initial state, standing in the default pose."""
 
     rollout: Rollout
     body: WholeBody

@@ -29,7 +29,7 @@ MAX_VIOLATION = 0.05  # [1] clip of the violations that raise multipliers
 
 @dataclass(frozen=True)
 class Stage:
-    """Settings of one stage of a smoothed descent."""
+    """Settings of one stage of an optimisation by smoothed descent."""
 
     keep: int  # Number of best starts that enter the stage
     iterations: int  # Gradient steps of the stage
@@ -70,7 +70,7 @@ def exact(values: Values) -> torch.Tensor:
 
 
 def merit_of(problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> torch.Tensor:
-    """Simulate candidates x (n, len(problem.knots)); return their merit (n,), lower is better, infinite for NaN."""
+    """Simulate candidates x (n, len(problem.knots)), and return their merit (n,), lower is better, infinite for NaN."""
     with torch.no_grad():
         merits = torch.cat([merit(problem.evaluate(part)) for part in x.split(BATCH)])
     return torch.nan_to_num(merits, torch.inf)
@@ -86,13 +86,13 @@ def sort_by_merit(
 
 
 def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> torch.Tensor:
-    """Return the augmented Lagrangian (n,) of n candidates; with multipliers (n, m) of 0 it equals `penalised`."""
+    """Return the augmented Lagrangian (n,) of n candidates, which equals `penalised` for multipliers (n, m) of 0."""
     pressed = (multipliers + 2.0 * penalty * values.constraints).clamp_min(0.0)
     return values.objective + (pressed.square() - multipliers.square()).sum(1) / (4.0 * penalty)
 
 
 def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
-    """Combine each start of the search with other starts at random: first knots of one, last knots of another.
+    """Return new starts of the search that join the first knots of one start to the last knots of a random other.
 
     Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
     shifted in time by up to `SHIFT` knots.
@@ -129,7 +129,7 @@ class _BestPoints:
         self.x, self.merit = x, merit_of(problem, x, stage.merit)
 
     def update(self, x: torch.Tensor, slack: float) -> torch.Tensor:
-        """Store points x (n, len(knots)) that improve; return whether each exceeds its best by `slack`, bool (n, 1)."""
+        """Store points x (n, len(knots)) that improve; return whether each is worse than its best by over `slack`."""
         merit = merit_of(self.problem, x, self.stage.merit)
         better = merit < self.merit
         self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)

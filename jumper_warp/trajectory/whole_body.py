@@ -23,7 +23,7 @@ OUTER, INNER = 0, 1  # indices of a leg's two transversal motors, thighs or shan
 
 
 class LegFrames(NamedTuple):
-    """Poses and velocities of the links of four legs, world frame; axes (..., leg, link, ...).
+    """Poses and velocities of all links of the four legs, world frame; axes (..., leg, link, ...).
 
     Legs FL, FR, BL, BR; links housing, outer thigh, outer shank, inner thigh, inner shank.
     """
@@ -102,7 +102,7 @@ class WholeBody:
         self.mass = float(self._mass.sum())  # [kg] of the whole robot
 
     def _base(self, q: torch.Tensor, qd: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return rotation, origin, velocity and angular velocity of the base.
+        """Return rotation, position, velocity and angular velocity of the base, world frame.
 
         Rotation (..., 3, 3), origin [m], its velocity [m/s], angular velocity [rad/s]. Arguments q (..., 19), qd (...,
         18). Vectors: (..., 3), world frame.
@@ -252,7 +252,7 @@ class WholeBody:
         return self.clearance_of(q, *self.points(q))
 
     def clearance_of(self, q: torch.Tensor, pos: torch.Tensor, ankle: torch.Tensor) -> torch.Tensor:
-        """Return heights of the legs' links above level ground [m] from link positions that are already known.
+        """Return the heights [m] of the legs' links above level ground, from known positions of the links.
 
         As `clearance`, (..., 4, 4), from q (..., 19) and `pos`, `ankle` of `points`.
         """

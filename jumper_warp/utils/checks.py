@@ -30,7 +30,7 @@ LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies, tasks a
 
 
 def in_float32(value: float) -> str:
-    """Return a number as text for an error message, with the reason if float32 cannot hold it."""
+    """Return a number as text for an error message, with a note if float32 cannot hold it."""
     if FLOAT32_MAX < abs(value) < math.inf:
         return f"{value}, too large for float32"
     return f"{value}, too small for float32" if 0.0 < value < FLOAT32_MIN else f"{value}"
@@ -94,7 +94,7 @@ def check_types(section: str, cfg: Any) -> None:
 
 @functools.cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Return the evaluated annotations of a dataclass, empty if one cannot be evaluated."""
+    """Return the types of a dataclass's fields by name; empty if one of them cannot be evaluated."""
     try:
         return get_type_hints(kind)
     except (NameError, TypeError):
@@ -102,7 +102,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value has an annotated type."""
+    """Return whether a value is of an annotated type."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
@@ -116,7 +116,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _shown(hint: Any) -> str:
-    """Return an annotated type for messages, as `(float, float)` or `(RewardTerm, ...)`."""
+    """Return an annotated type as text for error messages, such as `(float, float)` or `(RewardTerm, ...)`."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(map(_shown, parts))
@@ -127,7 +127,7 @@ def _shown(hint: Any) -> str:
 
 
 def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float, str]]) -> None:
-    """Raise InputError for a number, or one of a pair, outside its range; None passes.
+    """Raise InputError if a number, or one of a pair of numbers, is outside its range; None passes.
 
     cfg: object with the fields that `bounds` names; bounds: (lower, upper, unit) by field. section: name of `cfg`, for
     messages.

@@ -19,7 +19,7 @@ WRITTEN_IN_PYTHON = re.compile(r"Trying to set Warp struct attribute that does n
 
 
 def codegen_error(error: Exception) -> tuple[str, str] | None:
-    """Return place (`file.py:12, function name`) and cause of an error in a Warp function; None: another error."""
+    """Return where and why Warp cannot compile a function (`file.py:12, function name`, cause); None: another error."""
     text = str(error.args[0]) if error.args else ""  # str(KeyError) would escape line breaks
     if not (places := PLACE.findall(text)):
         return None
@@ -34,7 +34,7 @@ def codegen_error(error: Exception) -> tuple[str, str] | None:
 
 @contextmanager
 def explained(types: Iterable[Any]) -> Iterator[None]:
-    """Raise InputError, with file and line, where a Warp function of the block does not compile, or sets no such field.
+    """Turn Warp's errors in the block about functions that it cannot compile into InputError, with file and line.
 
     types: of the function's arguments; their structs have the fields that it may use. Other exceptions propagate.
     """
@@ -48,7 +48,7 @@ def explained(types: Iterable[Any]) -> Iterator[None]:
 
 
 def _message(error: Exception, structs: Mapping[str, list[str]]) -> str | None:
-    """Return one line about an error in a function; None: another error. structs: names of fields by struct."""
+    """Describe in a line why Warp cannot compile a function; None: another error. structs: field names by struct."""
     found, owner, known = codegen_error(error), "", [name for fields in structs.values() for name in fields]
     if found is None:
         if not (match := WRITTEN_IN_PYTHON.fullmatch(str(error))):

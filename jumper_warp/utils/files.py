@@ -70,7 +70,7 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
 
 
 def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
-    """Return the content of a regular file; arguments and errors as `existing_file`."""
+    """Return the bytes of a regular file; arguments and errors are those of `existing_file`."""
     path = existing_file(path, purpose, limit, error)
     try:
         with path.open("rb") as file:
@@ -85,7 +85,7 @@ def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType
 def read_json(
     path: Path, purpose: str, limit: int = MAX_JSON_BYTES, error: ErrorType = InputError, finite: bool = True
 ) -> Any:
-    """Return the content of a JSON file; arguments and errors as `existing_file` and `parse_json`."""
+    """Read a JSON file and return its content; arguments and errors: see `existing_file` and `parse_json`."""
     return parse_json(read_file(path, purpose, limit, error), str(path), error, finite)
 
 
@@ -119,7 +119,7 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the entries of a JSON object as a dict. Raises InputError: a key occurs twice."""
+    """Convert the (key, value) pairs of a JSON object to a dict. Raises InputError: a key occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):
         raise InputError(f"{Counter(key for key, _ in pairs).most_common(1)[0][0]!r:.60} occurs twice")
@@ -127,7 +127,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _number(text: str) -> float:
-    """Return a number of a JSON text. Raises InputError: it is not finite."""
+    """Convert the text of a number in JSON to a float. Raises InputError: it is not finite."""
     value = float(text)
     if not math.isfinite(value):
         raise InputError(f"{text:.20} is not a finite number")
@@ -135,14 +135,14 @@ def _number(text: str) -> float:
 
 
 def _integer(text: str) -> int:
-    """Return an integer of a JSON text. Raises InputError: it has too many digits."""
+    """Convert the text of an integer in JSON to an int. Raises InputError: it has too many digits."""
     if len(text.lstrip("-")) > MAX_DIGITS:
         raise InputError(f"an integer of {len(text.lstrip('-'))} digits")
     return int(text)
 
 
 def _depth(content: Any, limit: int) -> int:
-    """Return the number of nested levels in JSON data, at most limit + 1."""
+    """Return how deep lists and objects are nested in JSON data, at most limit + 1."""
     parts = content.values() if isinstance(content, dict) else content if isinstance(content, list) else None
     if parts is None or limit < 0:
         return 0

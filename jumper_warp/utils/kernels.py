@@ -22,12 +22,12 @@ else:
 
 
 def records(structs: wp.array) -> NDArray[np.void]:
-    """Copy a Warp array of structs to a NumPy record array of its shape; synchronises with the device."""
+    """Copy a Warp array of structs to a NumPy array with a field for each of theirs; waits for the device."""
     return cast("NDArray[np.void]", structs.numpy())
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
-    """Compile the modules of kernels in parallel, or load them from Warp's cache; arguments as `loading_kernels`."""
+    """Compile the modules of kernels in parallel, or load them from Warp's cache, and wait; see `loading_kernels`."""
     with loading_kernels(kernels, device):
         pass
 

@@ -42,7 +42,7 @@ class Outcome(Protocol):
 
     @property
     def trials(self) -> Mapping[str, np.ndarray]:
-        """Masks of the trials that metrics are computed from, by name such as "landed jumps".
+        """Masks that select the trials from which a metric is computed, by name such as "landed jumps".
 
         Bool, shape of the arrays' first axes.
         """
@@ -59,12 +59,12 @@ class Metric(NamedTuple):
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit at the end of a metric's key, as `_m_s` or ` [m/s]`; None: without unit, such as a count."""
+    """Return the unit in the name of a metric, such as m/s for `..._m_s` or `... [m/s]`; None: no unit, as a count."""
     return split_unit(key)[1]
 
 
 def split_unit(key: str) -> tuple[str, str | None]:
-    """Split a metric's key into the key without its unit, and the unit, as `unit_of`."""
+    """Split the name of a metric into the name without its unit, and the unit, see `unit_of`."""
     if bracket := re.search(r" *\[(.+)\]$", key):
         return key[: bracket.start()], bracket[1]
     return next(((key.removesuffix(end), unit) for end, unit in UNITS.items() if key.endswith(end)), (key, None))
@@ -92,7 +92,7 @@ def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
 
 
 def rate(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the fraction of true values (n,) as a metric with Wilson's interval; over: description of the trials."""
+    """Return the fraction of true values (n,) as a metric with Wilson's 95 % interval; over: what the trials are."""
     values = np.asarray(values, dtype=bool)
     n, p = values.size, float(values.mean()) if values.size else None
     if p is None:
@@ -104,7 +104,7 @@ def rate(values: ArrayLike, over: str = "") -> MetricValue:
 
 
 def mean(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the mean of the finite values as a metric with a bootstrap interval; over: description of the trials."""
+    """Return the mean of the finite values as a metric with a bootstrap interval; over: what the trials are."""
     values = np.asarray(values, dtype=float).ravel()
     known = np.isfinite(values)
     return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
@@ -119,7 +119,7 @@ def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
 
 
 def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda ratio: ratio) -> MetricValue:
-    """Return a metric from the ratio of the sums of two columns, with a bootstrap interval.
+    """Return a metric, `function` of the ratio of two columns' sums, with a bootstrap interval over the rows.
 
     rows: (trials, 2), the second column numbers of samples; function: of the ratio.
     """
@@ -132,14 +132,14 @@ def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda 
 
 
 def largest(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the largest of the finite values as a metric; over: description of the trials."""
+    """Return the largest of the finite values as a metric; over: what the trials are."""
     values = np.asarray(values, dtype=float).ravel()
     values = values[np.isfinite(values)]
     return MetricValue(float(values.max()) if len(values) else None, len(values), None, over)
 
 
 def resampled_means(rows: np.ndarray) -> np.ndarray:
-    """Return the means of RESAMPLES bootstrap samples of trials: (RESAMPLES, columns) from (n, columns)."""
+    """Return the column means (RESAMPLES, columns) of bootstrap samples that are drawn from rows (n, columns)."""
     rng, n = np.random.default_rng(BOOTSTRAP_SEED), len(rows)
     at_once = max(1, min(RESAMPLES, BATCH // n))
     sizes = [min(at_once, RESAMPLES - done) for done in range(0, RESAMPLES, at_once)]

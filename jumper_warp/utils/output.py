@@ -19,7 +19,7 @@ VERSION = 1  # Version of the layout of metrics.json
 
 
 def output_dir(name: str, out: Path | None = None) -> Path:
-    """Create and return the folder for one run's results.
+    """Create the folder for the results of one run, and return it.
 
     name: name of the experiment, one path component. out: the folder, which may exist (default:
     `outputs/<name>/<YYYY-mm-dd_HH-MM-SS>`, with a number appended if two runs start in the same second).
@@ -73,7 +73,7 @@ def read_values(folder: Path) -> dict[str, Any]:
 
 
 def _entry(key: str, value: Any) -> dict[str, Any]:
-    """Return a metric as its JSON object in metrics.json. Raises TypeError or InputError as `write_metrics`."""
+    """Convert a metric to its JSON object in metrics.json. Raises TypeError or InputError as `write_metrics`."""
     metric = value if isinstance(value, MetricValue) else MetricValue(value)
     number = _to_python(key, metric.value)
     interval = None if metric.interval is None else _to_python(key, list(metric.interval))

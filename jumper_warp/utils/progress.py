@@ -38,7 +38,7 @@ class _TimeLeft(ProgressColumn):
 
 @contextmanager
 def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object]]:
-    """Show the progress of long work while the block runs, if standard error is a terminal.
+    """Show title, elapsed time and progress of long work while the block runs, if standard error is a terminal.
 
     total: number of parts (default: unknown). Yields the function to call after each part, or with the number of parts
     that have been done since the last call. Phases may be nested. The display disappears at the end.
@@ -64,7 +64,7 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
 
 
 def shown(title: str, function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function that is a phase of its own where it runs in the main thread outside of other phases."""
+    """Return a function that shows its progress (`phase`) in the main thread, unless another phase is shown."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -66,7 +66,7 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
 
 
 def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
-    """Set up Warp's device and the CPU threads of a command, and print the device once.
+    """Choose the Warp device and the number of CPU threads of a command, and print the device once.
 
     Returns the device's properties. device: a Warp device (default: the current
     one). threads: CPU threads of simulations, as in `set_threads`. Raises InputError: there is no such device, or the
@@ -83,7 +83,7 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
 
 @functools.cache
 def _report_once(device: str | None, threads: int) -> DeviceInfo:
-    """Print a device once, at the first call with these arguments, and return the device's properties."""
+    """Print a line about a device at the first call with these arguments, and return the device's properties."""
     return report_device(device)
 
 
@@ -140,7 +140,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def source_versions() -> dict[str, Any]:
-    """Return git commit (hash or None), whether the tree is dirty, and package versions, by name, for this package."""
+    """Return by name the git commit of this package (or None), whether files have changed, and versions of packages."""
     commit = git_commit()
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 

@@ -42,7 +42,7 @@ def module_from_file(name: str, path: str | Path) -> ModuleType:
 
 
 def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
-    """Return a user's modules, then the loaded modules from the folders of their files, which they may have imported.
+    """Return a user's modules, and after them loaded modules from the same folders, which they may have imported.
 
     Folders of installed packages are left out.
     """
@@ -57,7 +57,7 @@ def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
 
 
 def own_fault(error: Exception, path: str) -> InputError:
-    """Return an exception as InputError with the line of a file that caused it; path: the file, as in tracebacks."""
+    """Convert an exception to an InputError with the line of the user's file that raised it; path: of the file."""
     message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == path]
     if not lines or PLACE.match(message):
@@ -93,7 +93,7 @@ def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
 
 
 def _modules(saved: Any) -> Iterator[str]:
-    """Yield the modules that saved data names: the part before the colon of each string with a colon."""
+    """Yield the names of modules in saved data: the part before the colon of each string with a colon."""
     if isinstance(saved, str):
         module, colon, _ = saved.partition(":")
         if colon:

@@ -1,4 +1,4 @@
-"""Printed tables."""
+"""Printing of tables to the terminal."""
 
 import io
 

@@ -63,7 +63,7 @@ WARP_LOCK = WarpLock()
 
 
 def locked(function: Callable[P, T]) -> Callable[P, T]:
-    """Return a function that holds `WARP_LOCK` while it runs."""
+    """Return a version of a function that holds `WARP_LOCK` while it runs."""
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Any:
@@ -109,7 +109,7 @@ def limit_spinning() -> None:
 
 
 def stop_spinning() -> None:
-    """Give torch one CPU thread at the first call, if its idle threads spin and OMP_NUM_THREADS is not set."""
+    """Limit torch to one CPU thread, once, if its idle threads spin and OMP_NUM_THREADS is not set."""
     global _torch_spins
     if _torch_spins and "OMP_NUM_THREADS" not in os.environ:
         sys.modules["torch"].set_num_threads(1)
@@ -126,7 +126,7 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     remaining, errors = iter(jobs), SimpleQueue()
 
     def work() -> None:
-        """Run jobs that remain, and put the exception that ended them, or None, into `errors`."""
+        """Run jobs until none remains; put the exception that one of them raised, or None, into `errors`."""
         error = None
         try:
             for job in remaining:
@@ -152,6 +152,6 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
 
 
 def _run_jobs() -> None:
-    """Run jobs of all `run_in_parallel` calls from the queue, as a worker thread that never ends."""
+    """Loop of a worker thread: take jobs of `run_in_parallel` calls from the queue and run them, without end."""
     while True:
         _jobs.get()()

@@ -116,14 +116,14 @@ def _images(
 
 
 def _shapes(recording: Recording, ranks: Sequence[int]) -> list[ShapeMesh]:
-    """Return the shapes to draw: those of some worlds, their goals, and shapes shared by all worlds."""
+    """Return the shapes that a film shows: those of some worlds, their goals, and those that all worlds share."""
     bodies = {-1}.union(*(recording.body_indices(rank) for rank in ranks))
     goals = [shape for shape in goal_shapes(recording) if int(shape.name.split("_")[1]) in ranks]
     return [shape for shape in recording.shapes if shape.body in bodies] + goals
 
 
 def _interpolated(recording: Recording, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Interpolate values of the recording's frames, (num_frames, ...), to times [s]; return (times, ...)."""
+    """Interpolate one value per recorded frame, (num_frames, ...), to times [s]; return (times, ...)."""
     columns = [np.interp(times, recording.times, column) for column in values.reshape(len(values), -1).T]
     return np.stack(columns, axis=1).reshape(len(times), *values.shape[1:])
 
@@ -159,7 +159,7 @@ def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None)
 
 
 def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:
-    """Return trails of base and paws up to a frame, and arrows of commanded and actual velocity.
+    """Return the lines that an image shows: recent paths of base and paws, arrows of commanded and actual velocity.
 
     paths: base positions as drawn [m], (num_frames, worlds, 3); bases: at the image's time [m], (worlds, 3).
     """

@@ -40,7 +40,7 @@ FORMATS = {".png": {}, ".webp": {"quality": 88, "method": 6}, ".jpg": {"quality"
 
 @dataclass(frozen=True)
 class Composition:
-    """Scene of a composite picture: one robot at several times of a recording, in a vertical plane.
+    """Content of a composite picture: one robot at several times of a recording, in a vertical plane.
 
     The plane contains the robot's path.
     """
@@ -86,13 +86,13 @@ class Composition:
         return np.array([self.right[1], -self.right[0], 0.0])
 
     def span(self) -> tuple[float, float]:
-        """Return the least and the largest coordinate of the picture's content along `right` [m]."""
+        """Return the left and right end [m] of the picture's content, along its horizontal axis."""
         along = corners(self.bases) @ self.right
         label = 0.75 if self.stays and len(self.heights) else 0.0  # right of the last robot
         return float(along.min()) - 0.15, float(along.max()) + 0.15 + label
 
     def point(self, along: float, height: float, in_front: float = 0.0) -> np.ndarray:
-        """Return a point of the picture's vertical plane [m], (3,), world frame, from its two coordinates.
+        """Return the position (3,) [m] in the world of a point in the picture's vertical plane.
 
         along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it and
         of all drawn robots [m], if not 0.
@@ -159,12 +159,12 @@ def _events(height: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _spread(frames: list[int], count: int) -> list[int]:
-    """Return at most `count` of the frames, evenly spread over them."""
+    """Return at most `count` of the given frames, evenly spread over them."""
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
 
 
 def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
-    """Choose up to MOST frames at least GAP apart in the picture: apexes, end, start, touchdowns and takeoffs first.
+    """Choose up to MOST frames of a recording, at least GAP apart in the picture, those of important events first.
 
     places: base positions in the picture [m], (num_frames, 2), to the right and up.
     """
@@ -190,7 +190,7 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` frames with equal motion of the bodies between them; poses: (num_frames, bodies, 3 or more)."""
+    """Choose `count` frames between which the bodies move equally far; poses: (num_frames, bodies, 3 or more)."""
     steps = np.linalg.norm(np.diff(poses[..., :3], axis=0), axis=-1).sum(axis=1)
     moved = np.concatenate([[0.0], np.cumsum(steps)])
     return np.searchsorted(moved, np.linspace(0.0, 0.99 * moved[-1], count))
@@ -306,7 +306,7 @@ def _lines(scene: Composition) -> list[Line]:
 
 
 def _ticks(scene: Composition) -> np.ndarray:
-    """Return the heights [m] of the scale's marks: every 0.25 m, wider above 1.5 m; none without ground."""
+    """Return the heights [m] at which the picture's scale has marks: every 0.25 m or wider; none without ground."""
     if not scene.grounded:
         return np.zeros(0)
     top = max(float(scene.bases[:, 2].max()), *scene.heights, 0.25)

@@ -23,7 +23,7 @@ WINDOW, MOST_WINDOWS, RESAMPLES = (5, 40), 100, 1000
 
 @contextmanager
 def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **settings: Any) -> Iterator[Any]:
-    """Yield the axes of a new plot; on exit, add a common legend below the axes and write the plot to `path`.
+    """Create a plot, yield its axes and, when the block ends, add a legend and write it to `path`.
 
     The legend has the labels of all axes without their own legend. title, conditions: lines above the axes; shape,
     settings: arguments of `plt.subplots`.
@@ -49,7 +49,7 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
 
 @dataclass(frozen=True)
 class Published:
-    """Results of a sweep of jumps in the paper, to be plotted."""
+    """Results of a sweep of jumps that the paper reports, to plot beside own results."""
 
     mean_error: float  # [m] Mean error in simulation
     robot: tuple[tuple[float, float, float], ...]

@@ -33,7 +33,7 @@ class Recorder:
         notes: Mapping[str, Any] | None = None,
         labels: Sequence[str] = (),
     ) -> None:
-        """Prepare to record some worlds of a model, whose bodies and shapes are read once, here.
+        """Prepare to record some worlds of a Newton model; its bodies and shapes are read here, once.
 
         spacing: distance [m] along y between the drawings of consecutive worlds; 0 for true positions, required for a
         heightfield. notes: metadata of JSON types, saved with the recording. labels: names of the worlds.
@@ -157,7 +157,7 @@ class Recorder:
         )
 
     def save_npz(self, path: Path) -> Path:
-        """Write the recording as a NumPy archive, which `load_npz` reads; return its path."""
+        """Write the recording so far as a NumPy archive, which `load_npz` reads; return its path."""
         return self.recording().save_npz(path)
 
     def save_rrd(self, path: Path) -> Path:

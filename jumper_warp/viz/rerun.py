@@ -217,7 +217,7 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
 
 @dataclass(frozen=True)
 class _Plot:
-    """Plot in the Rerun viewer: the curves of one entity."""
+    """One plot of the Rerun viewer: the curves that belong to one entity."""
 
     group: str  # of the series
     title: str  # `quantity [unit]`

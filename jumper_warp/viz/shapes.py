@@ -54,7 +54,7 @@ def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
 
 
 def _surface(kind: GeoType, scale: np.ndarray, source: Any, label: str) -> trimesh.Trimesh:
-    """Return the mesh of one shape in the shape's frame. Raises InputError: a kind that cannot be drawn.
+    """Return the triangle mesh of one shape, in its frame. Raises InputError: a kind that cannot be drawn.
 
     scale: Newton's three size parameters [m], or of a mesh [1]. source: mesh or heightfield. label: for the error.
     """

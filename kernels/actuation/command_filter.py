@@ -28,7 +28,7 @@ COMMAND_BOUND = wp.constant(real(12.566370614359172))
 
 @wp.struct
 class Limits:
-    """Limits of one quantity (a motor angle or a sum of two), and widths of the hard zones inside them (0: none)."""
+    """Limits of a motor angle or sum of angles, and widths of the hard zones inside them (0: none)."""
 
     lower: real  # [rad]
     upper: real  # [rad]
@@ -70,7 +70,7 @@ def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: r
 
 @wp.func
 def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the command [rad] of a motor angle or sum of angles after the filter; the quantity is at `pos`, `vel`.
+    """Return the filtered command [rad] of a motor angle or sum of angles, whose measured value and rate are pos, vel.
 
     pos [rad], vel [rad/s]; see `limit_weight`.
     """

@@ -40,7 +40,7 @@ class JointForces:
 
 @wp.func
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
-    """Return damping coefficients [N m s/rad] for a leg's motor damping and Coulomb friction at `rates` [rad/s]."""
+    """Return damping coefficients [N m s/rad] that stand for a leg's motor damping and friction at `rates` [rad/s]."""
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
         p.damping[1] + p.friction[1] / wp.max(wp.abs(rates[1]), FRICTION_SPEED),

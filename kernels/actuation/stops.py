@@ -95,7 +95,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] are beyond a hard stop of a leg, or NaN; a step ending within presses none."""
+    """Return whether motor angles [rad] of a leg are beyond a hard stop or NaN; steps that end within press no stop."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):
@@ -105,13 +105,13 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return which stop of row i (a motor or their sum) is in the set `pressed`: 0 (none), LOWER_STOP or UPPER_STOP."""
+    """Return which stop of row i (a motor or their sum) is pressed in the set: 0 (none), LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
 @wp.func
 def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int) -> int:
-    """Return the set of hard stops that a leg presses if its motors end the step at `rates` [rad/s].
+    """Return which hard stops a leg presses, as a bit set, if its motors end the step at `rates` [rad/s].
 
     pressed: the set with which `rates` was solved; a stop is added or removed only beyond the slack [rad/s].
     """
@@ -130,7 +130,7 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the active set of hard joint stops with which a leg's step is solved next, after `sets` sets were tried.
+    """Return the set of hard stops to solve a leg's step with next, after `sets` other sets were tried.
 
     The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s].
     """
@@ -146,7 +146,7 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether only one hard stop per world may change in the active set that a step tries after `sets` sets."""
+    """Return whether only one hard stop per world may change in the next set of stops, after `sets` sets were tried."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TurnRanges:
-    """Ranges of sampled rotations to the goal orientation, body axes."""
+    """Ranges from which the rotation to a goal orientation is sampled, body axes."""
 
     angle: wp.vec2  # [rad] (smallest, largest)
     body_axis_probability: float  # of an axis +-x, +-y or +-z; else the axis is uniform over the sphere
@@ -56,7 +56,7 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 
 @wp.func
 def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Return the state whose goal is the present orientation turned by `values`; all zeros: the present orientation.
+    """Return the state with the goal that a rotation `values` from the present orientation leads to; zeros: no turn.
 
     values: quaternion xyzw of any length, body axes. scene and heading are unused (signature of `command.set`).
     """

@@ -31,7 +31,7 @@ class AttitudeSettings:
 
 @wp.struct
 class AttitudeStart:
-    """Inputs that all attempts to sample one start state share: base pose and velocity, limits and ground."""
+    """Inputs shared by all attempts to sample one start state: base pose and velocity, limits and ground."""
 
     pos: wp.vec3  # [m] of the base
     quat: wp.quat  # xyzw, body to world

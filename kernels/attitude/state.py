@@ -9,7 +9,7 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """State of the attitude task in one world: goal orientation, error, collisions and statistics.
+    """State of the attitude task in one world: goal orientation, error, collisions, statistics of episodes.
 
     Fields from `episodes` on accumulate until the host reads them.
     """
@@ -48,7 +48,7 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the state with a new goal orientation; quat, goal: present and new orientation (xyzw, body to world)."""
+    """Return the task state with a new goal; quat, goal: present and goal orientation (xyzw, body to world)."""
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
@@ -76,7 +76,7 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return a new episode's state that has only the statistics of `old`, the state of the previous episode.
+    """Return a state for a new episode that keeps only the accumulated statistics of `old`, the previous state.
 
     They include that episode if it was complete. The reset sets the other fields.
     """
@@ -104,5 +104,5 @@ def attitude_error(robot: RobotView, state: AttitudeState) -> float:
 
 @wp.func
 def every_episode(state: AttitudeState) -> bool:
-    """Return True: the curriculum counts every episode."""
+    """Return True, since every episode counts for the curriculum."""
     return True

@@ -63,7 +63,7 @@ def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
-    """Return a cheap lower bound [m^2] on `segment_box_sq`: the squared distance of the segment's bounding box."""
+    """Return a cheap lower bound [m^2] on the squared distance of a segment from a box (`segment_box_sq`)."""
     gap = wp.max(wp.min(start, end) - half, -half - wp.max(start, end))
     gap_outside = wp.max(gap, vec3(real(0.0)))
     return wp.dot(gap_outside, gap_outside)

@@ -63,7 +63,7 @@ class LegCapsules:
 
 @wp.struct
 class Collisions:
-    """Forbidden contacts of one robot as bit flags, and the smallest distance of all pairs that are checked."""
+    """Forbidden contacts of one robot as bit flags, and the smallest distance [m] of all checked pairs."""
 
     flags: int  # bitmask of BODY_GROUND to LEG_SHELL
     clearance: real  # [m] smallest distance of all, negative in contact
@@ -229,7 +229,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 @wp.func
 def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
-    """Update a robot's forbidden contacts by one distance [m]: clearance, and `flag` (a bit) if it is < least [m]."""
+    """Return `collisions` with one more distance [m] included: the clearance, and bit `flag` if it is < least [m]."""
     result = Collisions()
     result.flags = collisions.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(collisions.clearance, distance)

@@ -13,7 +13,7 @@ from .leg_dynamics import LegDynamics
 
 @wp.struct
 class LegSolve:
-    """A leg's motor accelerations as a linear function of the base's acceleration, after their elimination.
+    """A leg's motor accelerations as a linear function of the base's acceleration.
 
     q'' = free - to_lin a - to_ang alpha; rows are lateral, outer, inner.
     """
@@ -46,7 +46,7 @@ class BaseInverse:
 
 @wp.func
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
-    """Eliminate a leg's motor accelerations from the equations of motion, as a function of the base's acceleration.
+    """Solve a leg's equations of motion for its motor accelerations, as a linear function of the base's acceleration.
 
     implicit: matrix added to D [kg m^2]; torque: tau [N m], motor space.
     """
@@ -61,7 +61,7 @@ def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
 
 @wp.func
 def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
-    """Return the equations of motion of the base link without its legs.
+    """Return the equations of motion of the base link alone, without the legs.
 
     omega: angular velocity [rad/s]; g: gravity [m/s^2]; force [N], moment [N m] about the origin: external; all in body
     axes.
@@ -103,7 +103,7 @@ def invert(system: BaseSystem) -> BaseInverse:
 
 @wp.func
 def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the base's linear acceleration [m/s^2] under a force and moment.
+    """Return the base's linear acceleration [m/s^2] under a force [N] and moment [N m].
 
     For a linear and an angular impulse it is a velocity [m/s].
     """
@@ -112,7 +112,7 @@ def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
 
 @wp.func
 def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the base's angular acceleration [rad/s^2] under a force and moment.
+    """Return the base's angular acceleration [rad/s^2] under a force [N] and moment [N m].
 
     For a linear and an angular impulse it is a velocity [rad/s].
     """

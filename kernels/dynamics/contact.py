@@ -38,7 +38,7 @@ SLIDE = wp.constant(2)
 
 @wp.struct
 class PawContact:
-    """Contact problem of one paw in a step: normal, friction, Jacobian and velocity responses to impulses.
+    """Data of one paw's contact in a step: normal, friction, Jacobian and velocity responses to impulses.
 
     Vectors in body axes, motors lateral, outer, inner.
     """
@@ -63,7 +63,7 @@ class PawContact:
 
 @wp.struct
 class BlockLaw:
-    """Constants that determine a sliding block's velocity at the end of a step (`block_velocity`), body axes."""
+    """Values from which a sliding block's velocity at the end of a step is computed, body axes."""
 
     velocity: vec3  # at the start of the step [m/s]
     up: vec3  # world z
@@ -97,7 +97,7 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Compute how impulses on a paw change its contact velocity, through the leg and through the base.
+    """Compute how the velocity of a paw's contact responds to impulses on it, through the leg and the base.
 
     Returns the contact with `from_lin` to `total` set; point [m]: point of contact from the base origin, body axes.
     """
@@ -171,7 +171,7 @@ def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
 
 @wp.func
 def block_velocity(block: BlockLaw, push: vec3) -> vec3:
-    """Return the block's velocity [m/s] at the end of the step; push [N s]: impulse of the paws on it; body axes.
+    """Return the sliding block's velocity [m/s] at the end of a step, body axes; push [N s]: the paws' impulse on it.
 
     Coulomb friction with the floor, under the weight and the paws' load, reduces the horizontal speed, at most to 0.
     """
@@ -186,7 +186,7 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Turn a paw's contact into one with the sliding block, and include the block's response to impulses.
+    """Change a paw's contact into one with the sliding block, which also moves under the paw's impulse.
 
     `on_block` is 1, and `total` includes the response.
     """
@@ -199,7 +199,7 @@ def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
 
 @wp.struct
 class ContactState:
-    """State of the Gauss-Seidel iteration of a world's contacts: change of the base's velocity, and convergence.
+    """State of the iterative contact solver in a world: change of the base's velocity, and convergence.
 
     Changes are relative to the motion without contact, body axes.
     """

@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Drive:
-    """Inputs of a launch: motor targets, joint forces and a wrench on the base, constant during the launch."""
+    """Inputs that drive the robots in a launch: motor targets, joint forces and a wrench on the base, all constant."""
 
     closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
     motors: MotorArrays
@@ -27,7 +27,7 @@ class Drive:
 
 @wp.struct
 class LegDrive:
-    """Motor targets, motor constants and added torques of one leg in a launch; vectors are lateral, outer, inner."""
+    """Inputs that drive one leg in a launch: targets, motor constants and added torques (lateral, outer, inner)."""
 
     closed_loop: int  # as in `Drive`
     lateral: MotorParams
@@ -41,7 +41,7 @@ class LegDrive:
 
 @wp.struct
 class Workspace:
-    """Arrays that the solver writes and that persist between launches; per-world arrays are (num_worlds,)."""
+    """Results and working arrays of the solver, which persist between launches; per-world arrays are (num_worlds,)."""
 
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the last step, world frame, (4, num_worlds)
     contact_force: wp.array2d(dtype=vec3)  # [N] on each paw in the last step, world frame, (4, num_worlds)

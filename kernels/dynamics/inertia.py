@@ -11,7 +11,7 @@ from ..scalar import mat33, real, vec2, vec3, vec5, vec6
 
 @wp.struct
 class MassMoments:
-    """Mass moments of one or more links; the user of the struct states the point and the axes."""
+    """Mass, first and second moments of mass of one or more links; the user states the point and the axes."""
 
     mass: real  # [kg]
     first: vec3  # [kg m]
@@ -20,13 +20,13 @@ class MassMoments:
 
 @wp.func
 def trace(s: vec6) -> real:
-    """Return the trace [kg m^2] of packed second moments."""
+    """Return the trace [kg m^2] of the matrix of packed second moments."""
     return s[0] + s[1] + s[2]
 
 
 @wp.func
 def mul(s: vec6, v: vec3) -> vec3:
-    """Return the product S v of a matrix S of packed second moments and a vector."""
+    """Return the product S v of the symmetric matrix S in packed second moments and a vector v."""
     return vec3(
         s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
         s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
@@ -129,7 +129,7 @@ def skew(v: vec3) -> mat33:
 
 @wp.func
 def symmetric(xx: real, xy: real, xz: real, yy: real, yz: real, zz: real) -> mat33:
-    """Return the symmetric matrix with the given upper triangle."""
+    """Return the symmetric 3x3 matrix with the given entries of its upper triangle."""
     return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
 

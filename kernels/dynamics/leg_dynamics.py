@@ -32,7 +32,7 @@ class LegMasses:
 
 @wp.struct
 class LegPose:
-    """Configuration of a leg: the five-bar in the housing, and the housing's rotation about body x."""
+    """Configuration of a leg: five-bar in the motor housing, and the housing's rotation about body x."""
 
     loop: FiveBar
     cosine: real  # of the rotation, the lateral angle times `LegGeometry.side`
@@ -112,7 +112,7 @@ def centrifugal(second_j: vec5, w: vec3) -> real:
 
 @wp.func
 def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> MassMoments:
-    """Return the mass moments of a leg about the base origin, body axes; cosine, sine: see `LegPose`."""
+    """Return a leg's mass and its moments of mass about the base origin, body axes; cosine, sine: see `LegPose`."""
     first = rotate_x(sums.first, cosine, sine)
     body = MassMoments()
     body.mass = sums.mass
@@ -127,7 +127,7 @@ def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Mass
 
 @wp.func
 def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
-    """Return a leg's inertia and couplings to the base, with all bias forces zero; cosine, sine: see `LegPose`."""
+    """Return a leg's inertia and its couplings to the base, with zero bias forces; cosine, sine: see `LegPose`."""
     leg = LegDynamics()
     second = sums.second
     lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x

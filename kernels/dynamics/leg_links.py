@@ -60,7 +60,7 @@ def cross_y_second(s: vec6) -> vec5:
 
 @wp.func
 def spin_y(s: vec6) -> vec3:
-    """Return the angular momentum [kg m^2] per unit rate about +y of masses with packed second moments s.
+    """Return the angular momentum per unit rate [kg m^2] of masses that rotate about +y, from second moments s.
 
     It is the integral of r x (e_y x r).
     """

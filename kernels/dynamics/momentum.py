@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RobotMomentum:
-    """Mass moments and momentum of a robot, body axes."""
+    """Mass, moments of mass, and linear and angular momentum of a robot, body axes."""
 
     body: MassMoments  # of the whole robot about the base origin
     lin: vec3  # [kg m/s]
@@ -29,7 +29,7 @@ class RobotMomentum:
 
 @wp.struct
 class Momenta:
-    """Momenta of all worlds, world axes, shape (num_worlds,)."""
+    """Linear and angular momentum of every robot, world axes, arrays (num_worlds,)."""
 
     lin: wp.array(dtype=vec3)  # [kg m/s]
     ang: wp.array(dtype=vec3)  # [kg m^2/s] about the robot's centre of mass

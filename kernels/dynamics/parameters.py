@@ -108,7 +108,7 @@ def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float,
 
 @wp.func
 def body_row(body: int) -> int:
-    """Return the parameter table's first row of the mass moments of a body, 0 (base) to 20, of a world."""
+    """Return the first row that a body's mass moments have in the parameter table; body: 0 (base) to 20."""
     if body == 0:
         return layout.BASE
     return ((body - 1) // layout.LEG_BODIES) * layout.LEG_ROWS + ((body - 1) % layout.LEG_BODIES) * layout.MOMENT_ROWS
@@ -192,7 +192,7 @@ def paw_friction(
 
 @wp.func
 def store_friction(table: wp.array2d(dtype=real), leg: int, world: int, mu: float, static_ratio: float):
-    """Write a paw's dynamic friction coefficient mu and its static one, mu * static_ratio, to the parameter table."""
+    """Write a paw's dynamic and static friction coefficients, mu and mu * static_ratio, to the parameter table."""
     table[leg * layout.LEG_ROWS + layout.MU_DYNAMIC, world] = real(mu)
     table[leg * layout.LEG_ROWS + layout.MU_STATIC, world] = real(mu * static_ratio)
 
@@ -229,7 +229,7 @@ def repack_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Rewrite the parameters that domain randomisation samples, in the worlds whose mask (num_worlds,) is not 0.
+    """Update the parameter table by what domain randomisation changed, where mask (num_worlds,) is not 0.
 
     Launch over (worlds from `first` on, 25): threads 0 to 20 of a world write the mass moments of a body each, the
     other four a leg's armature, friction torques and paw friction. Inputs as in the pack kernels.

@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StateArrays:
-    """State of all worlds, in Newton's layout, see `state`."""
+    """Coordinates and velocities of joints and bodies of all worlds, in Newton's layout."""
 
     joint_q: wp.array(dtype=float)  # (43 num_worlds,)
     joint_qd: wp.array(dtype=float)  # (38 num_worlds,)

@@ -64,7 +64,7 @@ class LegParams:
 
 @wp.struct
 class LegTerms:
-    """Terms of one leg in the equations of motion of a step: dynamics, elimination of its motors, paw kinematics."""
+    """Contribution of one leg to a step's equations of motion: dynamics, eliminated motors, paw kinematics."""
 
     dynamics: LegDynamics
     solve: LegSolve
@@ -86,7 +86,7 @@ def leg_terms(
     params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return a leg's terms in the equations of motion of a step: dynamics, elimination of its motors, paw kinematics.
+    """Return what a leg contributes to a step's equations of motion: dynamics, eliminated motors, paw kinematics.
 
     In body axes; passive forces and pressed stops are included. angles [rad], rates [rad/s], torque [N m] of the
     motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: of the base, body axes.
@@ -109,7 +109,7 @@ def leg_terms(
 
 @wp.struct
 class Touch:
-    """Surface point nearest to a paw: its gap, normal and velocity."""
+    """Point of a surface that is nearest to a paw: its gap, normal and velocity."""
 
     gap: real  # [m] between surface and paw, negative inside
     normal: vec3  # unit, out of the surface, body axes
@@ -154,7 +154,7 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
 
 @wp.func
 def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
-    """Return the table row of paw k's friction coefficient: static where it stuck before the step, else dynamic.
+    """Return which table row holds paw k's friction coefficient: static if it stuck before the step, else dynamic.
 
     velocity [m/s]: of the contact point relative to the ground at the start of the step; impulse [N s]: in the
     preceding step; normal: unit; all in the same axes.
@@ -217,7 +217,7 @@ def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: 
 
 @wp.func
 def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return the inverse of the base's equations, or zero where a world's base is held, which prevents acceleration."""
+    """Return the inverse of the base's equations of motion; zero, so that it cannot accelerate, if the base is held."""
     if model.held.shape[0] > 0:
         if model.held[world] != 0:
             return BaseInverse()
@@ -226,7 +226,7 @@ def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInvers
 
 @wp.func
 def finite_base(base: BaseState) -> bool:
-    """Return whether a base state holds finite values only."""
+    """Return whether all values of a base state are finite."""
     q = base.quat
     total = wp.dot(base.pos, base.pos) + wp.dot(base.lin, base.lin) + wp.dot(base.ang, base.ang)
     return wp.isfinite(total + q[0] + q[1] + q[2] + q[3])

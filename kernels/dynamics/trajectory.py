@@ -20,7 +20,7 @@ FILTER_ROWS = wp.constant(14)
 
 @wp.struct
 class Timing:
-    """Numbers of policy and physics steps of a rollout, and the spacing of its recorded rows."""
+    """Numbers of policy and physics steps of a rollout, and of physics steps between recorded rows."""
 
     steps: int  # T, policy steps
     substeps: int  # S, physics steps in a policy step
@@ -29,7 +29,7 @@ class Timing:
 
 @wp.struct
 class Actuation:
-    """Constants of motors, latency and command filter of every world, from targets to torques."""
+    """Constants of motors, latency and command filter of every world, with which targets become torques."""
 
     motors: MotorArrays  # without its fades, see `fade`
     fade: wp.array2d(dtype=real)  # [rad/s], (2, num_worlds): start and end of the over-speed protection
@@ -64,7 +64,7 @@ class TrajectoryArrays:
 
 @wp.func
 def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) -> BaseState:
-    """Convert a trajectory row's entries to the base's state: pos [m], orientation (xyzw), com_lin [m/s], ang [rad/s].
+    """Convert the base's entries of a trajectory row to a base state: pos [m], orientation, com_lin [m/s], ang [rad/s].
 
     com_lin: velocity of the com; com [m]: centre of mass in the base's frame; all others in world axes.
     """
@@ -155,7 +155,7 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Interpolation of a motor's target in a physics step, between two delayed policy targets."""
+    """Weights of the two delayed policy targets between which a motor's target lies in a physics step."""
 
     older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # policy step of the target at the end of the physics step
@@ -185,7 +185,7 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 def policy_target(
     filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
 ) -> real:
-    """Return the filtered target [rad] of motor 0 to 11 in policy step `step`; step -1: its initial target."""
+    """Return the target [rad] of motor 0 to 11 after the command filter in policy step `step`; -1: initial target."""
     if step < 0:
         return initial_target[motor, world]
     return filtered_target[step, motor, world]
@@ -195,7 +195,7 @@ def policy_target(
 def arrived_target(
     commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
 ) -> real:
-    """Return the target [rad] that motor 0 to 11 follows in a physics step; filtered_target: (T, 12, num_worlds)."""
+    """Return the delayed target [rad] that motor 0 to 11 follows in a physics step, interpolated as `arrived` says."""
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer

@@ -30,7 +30,7 @@ class GroundRanges:
 
 @wp.func
 def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
-    """Return half extents [m] along world x, y of a box around the paws' centres in the widest stance.
+    """Return half the length and width [m], along world x, y, of a box around the paws in the widest stance.
 
     heading [rad]: yaw of the stance.
     """
@@ -43,7 +43,7 @@ def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
 
 @wp.func
 def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
-    """Return a block that is too heavy to slide (10^6 kg); center, half extents and height [m], world axes."""
+    """Return a block that does not slide, since it weighs 10^6 kg; center, half extents and height [m], world axes."""
     block = Block()
     block.exists = 1
     block.start = vec2(real(center[0]), real(center[1]))

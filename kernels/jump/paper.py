@@ -15,7 +15,7 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset
 
 @wp.func
 def height_reward(error: float, std: float, scale: float) -> float:
-    """Return phi_std + 3 psi_scale of a height error [m]."""
+    """Return the reward for a height error [m] of a jump: phi_std + 3 psi_scale."""
     return phi(error, std) + 3.0 * psi(error, scale)
 
 

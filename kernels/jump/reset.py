@@ -32,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class JumpSettings:
-    """Ranges from which the reset of a jump samples start states and ground."""
+    """Ranges from which the reset of a jump episode samples start state and ground."""
 
     states: ResetRanges
     grounds: GroundRanges
@@ -137,7 +137,7 @@ def begin_jump(
 
 @wp.func
 def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
-    """Return the state of the next jump of an episode, commanded at once.
+    """Return the task state in which the next jump of an episode begins, commanded at once.
 
     goal [m]: x, y relative to base position `pos` [m] and `heading` [rad], and base height at the apex, world z.
     """
@@ -207,13 +207,13 @@ def reset_jump(
 
 @wp.func
 def next_jump_due(state: JumpState) -> bool:
-    """Return whether a landed robot receives its next goal in this policy step."""
+    """Return whether a robot that has landed receives its next goal in this policy step."""
     return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 
 @wp.func
 def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
-    """Return the state of the next jump of an episode, to a goal sampled from `level`."""
+    """Return the state of an episode's next jump, whose goal is sampled from `level`."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
     new.next_jump_step = sample_next_jump_step(rng, state.next_jump_delay, level.next_jump_probability)
@@ -222,7 +222,7 @@ def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpL
 
 @wp.func
 def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
-    """Return the state with a commanded jump if the robot is at the start of an episode or has landed; else `state`.
+    """Return the state with a jump commanded from outside if the robot is at the start or has landed; else `state`.
 
     values: goal x, y [m] relative to base and heading [rad], base height at the apex [m], and, at the start only, the
     policy step of the command.
@@ -245,5 +245,5 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
 
 @wp.func
 def from_standing(state: JumpState) -> bool:
-    """Return whether the episode counts for the curriculum: it began standing or in the default pose."""
+    """Return whether the episode began standing or in the default pose, and so counts for the curriculum."""
     return state.start_mode <= DEFAULT

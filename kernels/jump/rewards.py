@@ -31,7 +31,7 @@ def just_landed(state: JumpState) -> bool:
 
 @wp.func
 def should_rest(state: JumpState) -> bool:
-    """Return whether the robot should stand still: before the command, and from 0.5 s after touchdown."""
+    """Return whether the robot should stand still: before the jump's command, and from 0.5 s after touchdown."""
     if state.phase == LANDED:
         return state.phase_steps >= REST_STEPS
     return state.phase == STANCE and not commanded(state)

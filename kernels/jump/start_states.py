@@ -71,7 +71,7 @@ class ResetRanges:
 
 @wp.struct
 class JumpStart:
-    """Inputs that all attempts to sample one start state of a jump share: start mode, goal, ranges and ground."""
+    """Inputs shared by all attempts to sample one start state of a jump: start mode, goal, ranges and ground."""
 
     start_mode: int  # STANDING to PUSHING
     heading: float  # [rad] yaw

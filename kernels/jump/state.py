@@ -13,7 +13,7 @@ vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
 @wp.struct
 class JumpState:
-    """State of the jump task in one world: goal, command, phase, and counters."""
+    """State of the jump task in one world: goal, start, phase of the jump, and counters of policy steps."""
 
     goal: wp.vec3  # [m] world: base x, y at landing, and commanded base height at the apex (0: any)
     start: wp.vec3  # [m] world, base origin where the jump began
@@ -47,11 +47,11 @@ def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
 
 @wp.func
 def commanded(state: JumpState) -> bool:
-    """Return whether a jump is commanded and not yet landed (the paper's c)."""
+    """Return whether a jump is commanded and the robot has not landed yet (the paper's c)."""
     return state.steps >= state.command_step and state.phase != LANDED
 
 
 @wp.func
 def waiting(state: JumpState) -> bool:
-    """Return whether a jump is commanded but the robot is still in stance."""
+    """Return whether the robot is still in stance although a jump is commanded."""
     return state.phase == STANCE and state.steps >= state.command_step

@@ -42,7 +42,7 @@ class LegLimits:
 
 @wp.struct
 class LegPose:
-    """Joint angles of a leg for a target ankle position."""
+    """Motor and knee angles of a leg that bring its ankle to a target position, or nearest to it."""
 
     motors: vec3  # [rad] lateral, outer, inner
     knees: vec2  # [rad] outer, inner; passive
@@ -83,7 +83,7 @@ def nearest_lateral(geo: LegGeometry, limits: LegLimits, target: vec3, ankle_z: 
 
 @wp.func
 def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
-    """Return the motor angle [rad] of a thigh, on the branch whose knee points away from the other thigh.
+    """Return the motor angle [rad] at which a thigh's shank reaches the ankle, with its knee away from the other thigh.
 
     away [m]: ankle from the thigh's axis along x, positive away from the other thigh; z [m]: ankle in the housing
     frame. Out of reach, the leg is stretched or folded toward the ankle (`wp.acos` clamps its argument).
@@ -118,7 +118,7 @@ def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec
 
 @wp.func
 def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
-    """Return thigh angles [rad], outer and inner, at row, col (< GRID) of a grid over the limits, edges included."""
+    """Return the thigh angles [rad], outer and inner, of point (row, col) of a GRID x GRID grid within joint limits."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     along_row = real(row) / real(GRID - 1)

@@ -36,13 +36,13 @@ def first_leg(rng: RngStream) -> int:
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return the stride of this thread's loop over legs: 1 (all legs) with one thread a world, 4 (one leg) with 32."""
+    """Return by how much this thread's loop over legs advances: 1 with one thread a world, 4 (one leg) with 32."""
     return wp.min(rng.lanes, 4)
 
 
 @wp.func
 def all_legs(rng: RngStream, flag: bool) -> bool:
-    """Return whether `flag` is true in the threads of all legs of this thread's attempt."""
+    """Return whether `flag` is true for all legs of the start state that this thread's attempt samples."""
     if rng.lanes > 1:
         return all_of_attempt(flag)
     return flag
@@ -50,7 +50,7 @@ def all_legs(rng: RngStream, flag: bool) -> bool:
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Send the vector `v` of the thread that samples leg `leg` to all four threads of its attempt, and return it."""
+    """Return the vector `v` of the thread that samples leg `leg`, in all four threads of the sampling attempt."""
     return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 

@@ -15,7 +15,7 @@ RING = wp.constant(8)
 
 @wp.struct
 class Scene:
-    """Geometry and ground that all worlds share."""
+    """Leg geometry, ground and default pose, which all worlds share."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     ground: Ground
@@ -24,7 +24,7 @@ class Scene:
 
 @wp.struct
 class NoSettings:
-    """Empty settings struct, for resets without settings and tasks without levels."""
+    """Empty struct in place of settings, for resets without settings and tasks without levels."""
 
     unused: float
 
@@ -57,7 +57,7 @@ class EpisodeArrays:
 
 @wp.struct
 class Counters:
-    """Episode statistics that accumulate on the device until the host reads and clears them."""
+    """Statistics of episodes that accumulate on the device until the host reads and clears them."""
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds) `episode_sum`, summed over ended episodes
     termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds) ended episodes by termination term
@@ -69,7 +69,7 @@ class Counters:
 
 @wp.struct
 class SkillSettings:
-    """Constants of a skill: action scale, command filter, thresholds and margins."""
+    """Constants of a skill (task): action scale, command filter, thresholds and margins."""
 
     action_scale: vec12  # [rad] offset from the default pose at an action of 1
     command_filter: FilterParams

@@ -15,7 +15,7 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of
 
 @wp.func
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
-    """Return a sampled number of policy steps, at least 1, until an interval event is due again.
+    """Return a random number of policy steps, at least 1, after which an interval event is due again.
 
     It is uniform from least to most [s], over step_dt [s].
     """
@@ -23,7 +23,7 @@ def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> in
 
 
 def make_event_kernel(slots: list) -> wp.Kernel:
-    """Return the kernel that runs a task's events; slots: its `jumper_warp.tasks.params.TermSlot`s of events."""
+    """Return the kernel that runs a task's events, which change robot parameters; slots: `TermSlot`s of events."""
     modes = [MODES[slot.mode] for slot in slots]
 
     def event_kernel(

@@ -21,7 +21,7 @@ LANES = wp.constant(32)  # Threads that share the components of a world, so that
 
 @wp.struct
 class ObservationColumn:
-    """Indices of one scalar component of an observation term: where its value is read and written."""
+    """Indices of one number of an observation: where it is read, how it is processed, and where it is written."""
 
     raw: int  # row in `ObservationArrays.raw`
     group: int  # index of the group
@@ -52,7 +52,7 @@ class ObservationArrays:
 
 @wp.func
 def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
-    """Return where an observation component is read and written, from the index table `columns`.
+    """Return where a number of an observation is read and written, from the table of indices `columns`.
 
     columns: (fields of `ObservationColumn`, components).
     """
@@ -168,7 +168,7 @@ def finite_or_zero(value: float, diverged: bool) -> float:
 
 @wp.struct
 class StepContext:
-    """Values that all observation components of a world share in a policy step."""
+    """Values of a world in a policy step that are the same for all of its observations."""
 
     world: int
     step_key: wp.uint32  # see `mdp.random`
@@ -183,7 +183,7 @@ class StepContext:
 
 @wp.func
 def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
-    """Return what all observation components of a world share in a policy step: random key, flags and delay."""
+    """Return the values of a world that all its observations share in a policy step: random key, flags, delay."""
     step_count = episode.step_count[world]
     steps = arrays.latency[world] // arrays.substeps
     m = StepContext()
@@ -201,7 +201,7 @@ def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) 
 
 @wp.func
 def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
-    """Delay an observation component by the world's latency: store its new value, and return an earlier one.
+    """Store a new observation value, and return an earlier one, delayed by the world's latency.
 
     column: index in the ring buffer. The delayed value is linear between policy steps. Where an episode or skill
     begins, the ring is filled with value.

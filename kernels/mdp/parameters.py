@@ -57,7 +57,7 @@ class RobotParameters:
 
 @wp.func
 def moved_uniform(rng: RngStream, i: int, lower: float, upper: float, move: float) -> float:
-    """Return the i-th random number of a stream, uniform from lower + move to upper + move, each end at least 0."""
+    """Return random number i of a stream, uniform from lower + move to upper + move, both limits at least 0."""
     return uniform(rng, i, wp.max(lower + move, 0.0), wp.max(upper + move, 0.0))
 
 
@@ -140,7 +140,7 @@ def set_torque_limit(robot: RobotParameters, world: int, m: int):
 
 @wp.func
 def set_motor(robot: RobotParameters, world: int, m: int):
-    """Write gains, speeds and torque limit of motor m in a world for its active skill and its stored ratios."""
+    """Write gains, speeds and torque limit of a world's motor m, for its active skill and stored random ratios."""
     set_gains(robot, world, m, robot.gain_ratio[m, world])
     set_speed_limits(robot, world, m, robot.speed_ratio[m, world])
     set_torque_limit(robot, world, m)
@@ -205,13 +205,13 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return the number of physics steps in a time [s], rounded to the nearest."""
+    """Return a time [s] in physics steps, rounded to the nearest whole number."""
     return int(wp.round(seconds / robot.physics_dt))
 
 
 @wp.func
 def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: float) -> bool:
-    """Return whether a delay is the nominal one, with `nominal_probability`; never if its range is a single value."""
+    """Return at random whether a delay is nominal, with `nominal_probability`; never if its range is a single value."""
     return lower < upper and uniform(rng, 1, 0.0, 1.0) < nominal_probability
 
 

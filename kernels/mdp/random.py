@@ -33,7 +33,7 @@ class RngStream:
 
 @wp.func
 def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
-    """Return the key of all random streams of a world in one policy step; step_count: policy steps made."""
+    """Return the key from which all random streams of a world in one policy step follow; step_count: steps made."""
     return wp.rand_init(int(wp.rand_init(seed, world)), step_count)
 
 
@@ -59,7 +59,7 @@ def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: in
 
 @wp.func
 def fold_in(rng: RngStream, i: int) -> RngStream:
-    """Return a random stream derived from another one, independent for every i (as `jax.random.fold_in`)."""
+    """Return a new random stream that is derived from another and an index, independent for every i."""
     branch = rng
     branch.seed = wp.rand_init(int(rng.seed), 7919 + i)
     return branch

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def previous_state(old: Any, done: float):
-    """Return the previous episode's task state for a reset, with `steps` 0 if `Env.reset` interrupted the episode.
+    """Return the previous episode's task state, with `steps` 0 if `Env.reset` interrupted the episode.
 
     old: its state; done: 0 if it was interrupted.
     """

@@ -21,7 +21,7 @@ PAW_X, PAW_Y = 20, 24  # Indices in the stream of an attempt, each the first of 
 
 @wp.struct
 class LegSample:
-    """Sampled angles and rates of the motors of one leg."""
+    """Sampled motor angles and rates of one leg, and whether it can reach them."""
 
     angles: wp.vec3  # [rad] of the lateral, outer and inner motor
     rates: wp.vec3  # [rad/s]
@@ -30,7 +30,7 @@ class LegSample:
 
 @wp.func
 def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
-    """Return the motor angles, at rest, that put a leg's ankle at a position, by inverse kinematics.
+    """Return the motor angles, at rest, that bring a leg's ankle to a position (inverse kinematics).
 
     ankle [m]: position from the base origin, body axes.
     """
@@ -43,7 +43,7 @@ def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
 
 @wp.func
 def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
-    """Return a leg with the motor rates that move its ankle at `ankle_vel` [m/s] relative to the base, body axes."""
+    """Return a leg with motor rates that move its ankle at `ankle_vel` [m/s] relative to the base (body axes)."""
     sample = leg
     sample.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
     sample.reachable = leg.reachable and wp.length(sample.rates) <= MAX_LEG_SPEED

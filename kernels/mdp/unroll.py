@@ -11,7 +11,7 @@ from typing import Any
 
 
 def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> Any:
-    """Return a copy of a syntax tree or a list of them, with loops written out; a loop becomes a list of statements.
+    """Return a copy of a syntax tree, or a list of them, in which loops are replaced by copies of their bodies.
 
     A loop is replaced by copies of its body, one a value, if its `wp.static` expressions depend on the loop variable.
     names: values of the function's free and global names. values: of the variables of the loops around the node.
@@ -32,13 +32,13 @@ def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> An
 
 
 def _evaluated(bound: ast.expr, names: dict[str, Any]) -> int:
-    """Return the value of a bound of a loop, a constant or `wp.static(...)`."""
+    """Return the integer that a loop's bound evaluates to, a constant or `wp.static(...)`."""
     inner = bound.args[0] if isinstance(bound, ast.Call) else bound
     return eval(compile(ast.Expression(inner), "<bound of a loop>", "eval"), names)
 
 
 def _uses_in_static(loop: ast.For, name: str) -> bool:
-    """Return whether a `wp.static` expression in a loop contains a name."""
+    """Return whether a loop contains a `wp.static` expression that uses a name."""
     statics = [
         node
         for node in ast.walk(loop)

@@ -110,7 +110,7 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the state of a world's robot (`RobotView`) with the base's fields only; those of motors and paws are 0."""
+    """Return the state of a world's robot (`RobotView`) of which only the base is read; motors and paws are 0."""
     j = world * DOFS
     robot = RobotView()
     robot.world = world
@@ -220,7 +220,7 @@ def angle_from_level(quat: wp.quat, heading: float) -> float:
 
 @wp.func
 def tilt(robot: RobotView) -> float:
-    """Return the angle [rad], 0 to pi, between body z and world z."""
+    """Return the angle [rad], 0 to pi, by which the base is tilted: between body z and world z."""
     return wp.acos(wp.clamp(-robot.projected_gravity[2], -1.0, 1.0))
 
 

@@ -51,13 +51,13 @@ def near_default(robot: RobotView) -> bool:
 
 @wp.func
 def walk_to_jump_due(robot: RobotView, state: VelocityState, requested: bool) -> bool:
-    """Return whether walking hands over to a requested jump: commanded to stand, at rest and near the default pose."""
+    """Return whether a requested jump takes over from walking: at rest, commanded to stand, near the default pose."""
     return requested and state.standing == 1 and at_rest(robot) and near_default(robot)
 
 
 @wp.func
 def jump_to_walk_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """Return whether a jump hands over to walking: at rest after landing, or as recovery, requested or not.
+    """Return whether walking takes over from a jump: at rest after landing, or as recovery, requested or not.
 
     Recovery: tilted after landing, not at rest within RECOVER_STEPS, or no takeoff within NO_JUMP_STEPS.
     """
@@ -90,13 +90,13 @@ def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
 
 @wp.func
 def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """Return whether a jump hands over to requested turning: from FREE_STEPS policy steps after takeoff on."""
+    """Return whether requested turning takes over from a jump in flight: from FREE_STEPS steps after takeoff on."""
     return requested and state.phase == FLIGHT and state.phase_steps >= FREE_STEPS
 
 
 @wp.func
 def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
-    """Return whether turning hands back to its jump, requested or not: at contact, or shortly before the landing."""
+    """Return whether the jump takes over from turning in its flight again: at contact, or shortly before landing."""
     if robot.contacts > 0:
         return True
     if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:

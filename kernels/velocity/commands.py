@@ -15,7 +15,7 @@ MIN_COMMAND = wp.constant(0.05)  # [m/s], [rad/s] a command with all three compo
 
 @wp.struct
 class CommandRanges:
-    """Ranges of sampled commands; limits are largest speeds (ahead, back, to either side [m/s], turning [rad/s])."""
+    """Ranges from which commands are sampled; limits: largest speeds ahead, back, aside [m/s], turning [rad/s]."""
 
     first_range: wp.vec4  # limits at level 0
     last_range: wp.vec4  # limits at level `levels`
@@ -77,7 +77,7 @@ def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -
 
 @wp.func
 def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
-    """Return the state with a new command (ahead, to the left [m/s], yaw rate [rad/s]); a small one means to stand."""
+    """Return the task state with a new command (ahead, left [m/s], yaw rate [rad/s]); a small one means to stand."""
     new = state
     new.command = command
     new.command_steps = 0
@@ -89,7 +89,7 @@ def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
 
 @wp.func
 def resample_due(state: VelocityState) -> bool:
-    """Return whether another command is to be sampled in this policy step."""
+    """Return whether another velocity command is to be sampled in this policy step."""
     return state.command_lasts > 0 and state.command_steps >= state.command_lasts
 
 
@@ -107,7 +107,7 @@ def resample_velocity(
 def set_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
-    """Return the state with a commanded velocity that holds until the next command.
+    """Return the state with a velocity commanded from outside, which holds until the next command.
 
     values: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes; gait frequency [Hz], 0: unchanged. The other
     arguments are unused.

@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TileMap:
-    """A map of square tiles centred on the origin: difficulty grows with the row, the column is the kind of terrain."""
+    """Size of a terrain map of square tiles: difficulty grows with the row, the column is the kind of terrain."""
 
     rows: int  # number of tiles along x (terrain levels), 0: no map
     cols: int  # number of tiles along y
@@ -31,7 +31,7 @@ class TileMap:
 
 @wp.struct
 class VelocitySettings:
-    """Ranges of start states of velocity tracking; pairs are (lower, upper), half width w: sampled from -w to w."""
+    """Ranges from which start states of velocity tracking are sampled; pairs (lower, upper), half width w: -w to w."""
 
     map: TileMap
     episode_steps: int  # policy steps that an episode lasts
@@ -54,7 +54,7 @@ class VelocitySettings:
 
 @wp.struct
 class VelocityStart:
-    """Inputs that all attempts to sample one start state of velocity tracking share: place, ranges and ground."""
+    """Inputs shared by all attempts to sample one start state of velocity tracking: place, ranges and ground."""
 
     spot: wp.vec2  # [m] x, y around which the base is placed
     heading: float  # [rad] yaw

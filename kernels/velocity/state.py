@@ -54,7 +54,7 @@ def velocity_error(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 @wp.func
 def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
-    """Return the state with updated touchdown history, touchdown counts and swing heights of the paws."""
+    """Return the task state with the paws' touchdowns and swing heights of this policy step included."""
     t = state
     for k in range(4):
         touchdown = robot.first_contact[k]
@@ -113,5 +113,5 @@ def tracking_error(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def every_episode(state: VelocityState) -> bool:
-    """Return True: the curriculum counts every episode."""
+    """Return True, since every episode counts for the curriculum."""
     return True

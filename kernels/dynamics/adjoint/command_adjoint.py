@@ -39,7 +39,7 @@ class FilterAdjoint:
 
 @wp.func
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
-    """Add to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
+    """Add a number to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
 
     step: policy step, -1 for the initial target.
     """
@@ -88,7 +88,7 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 
 @wp.func
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
-    """Add the gradient of the loss w.r.t. a motor's constants and latency, through its torque in a step.
+    """Add a physics step's gradient of the loss w.r.t. a motor's constants and latency to the stored gradients.
 
     That w.r.t. constants goes to `sums`, that w.r.t. the latency to `shared`. cotangent: gradient w.r.t. the motor's
     torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
@@ -99,7 +99,7 @@ def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adj
 
 @wp.func
 def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
-    """Return a scalar for `wp.grad`, the adjoint of `filter_leg`: cotangent . (filtered targets of a leg [rad])."""
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `filter_leg`: cotangent . (filtered targets)."""
     return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
@@ -133,5 +133,5 @@ def filter_gradient(
 
 @wp.func
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
-    """Add the gradient w.r.t. a leg's measured angles to that w.r.t. the offsets of its position sensors."""
+    """Add the gradient w.r.t. a leg's measured angles to the gradient w.r.t. its position sensors' offsets."""
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

@@ -51,7 +51,7 @@ class Gradients:
 
 @wp.struct
 class ThreadSums:
-    """Array to which a GPU thread adds gradients w.r.t. parameters, and the threads of its warp to sum over first."""
+    """Destination of a GPU thread's gradients w.r.t. parameters, and the threads of its warp to sum over first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
@@ -63,7 +63,7 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return the destination of a thread's gradients w.r.t. parameters, `gradients.parameters`, with weight 1."""
+    """Return the settings with which a thread adds its gradients to `gradients.parameters`, with weight 1."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world

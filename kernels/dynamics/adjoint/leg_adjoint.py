@@ -49,7 +49,7 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Pack the contact law of a paw, its impulse, point and Jacobians for the record of the reverse pass.
+    """Collect the values of a paw's contact that the reverse pass needs: law, impulse, contact point and Jacobians.
 
     impulse [N s], point [m] of contact: body axes.
     """
@@ -71,7 +71,7 @@ def replay_leg(
     model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
-    """Recompute one physics step of a rollout, with a thread per leg, and record what its reverse pass needs.
+    """Recompute one physics step of a rollout, with a thread per leg, and record what the reverse pass needs of it.
 
     Starts from the state in entry i of the record and writes the state at the end of the step to entry i + 1. Entry i
     stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]: on the
@@ -132,13 +132,13 @@ def replay_leg(
 
 @wp.func
 def any_leg(flag: bool) -> bool:
-    """Return whether the flag is set in any of the four threads of the world."""
+    """Return whether any of the four threads (legs) of the world sets the flag."""
     return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
 
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return a 3x3 block of the matrix of the paws' contact-law multipliers: row of paw `leg`, column of paw j.
+    """Return the 3x3 block (paw `leg`, paw j) of the matrix from which the contact-law multipliers are solved.
 
     The matrix is A^T of `step_adjoint`. The arguments but j are those of this thread's leg. sent, sent_law: c and law
     again, of which thread j sends its own to the other threads.

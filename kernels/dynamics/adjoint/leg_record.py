@@ -46,7 +46,7 @@ class LegRecord:
 
 @wp.struct
 class BaseWeights:
-    """Multipliers of the base's equations of motion in a step, body axes."""
+    """Solved multipliers of the base's equations of motion in a step, for the reverse pass, body axes."""
 
     lin: vec3  # virtual velocity, see `virtual_power`
     ang: vec3  # virtual angular velocity
@@ -55,7 +55,7 @@ class BaseWeights:
 
 @wp.struct
 class LegWeights:
-    """Multipliers of a leg's equations of motion and of its paw's contact law."""
+    """Solved multipliers of a leg's equations of motion and of its paw's contact law, for the reverse pass."""
 
     rates: vec3  # virtual rates of the motors
     law: vec3  # multiplier of the contact law, body axes
@@ -171,7 +171,7 @@ def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
 
 @wp.func
 def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
-    """Return the recorded inverse of the matrix of the base's equations of motion in a step."""
+    """Return the recorded inverse of the base's equations of motion in a step (a 6x6 matrix)."""
     inverse = BaseInverse()
     inverse.lin = get_base_mat(record, entry, BASE_INVERSE, world)
     inverse.cross = get_base_mat(record, entry, BASE_INVERSE + 9, world)
@@ -181,7 +181,7 @@ def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
 
 @wp.func
 def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse):
-    """Write the inverse of the matrix of the base's equations of motion in a step to the record."""
+    """Write the inverse of the base's equations of motion in a step (a 6x6 matrix) to the record."""
     put_base_mat(record, entry, BASE_INVERSE, world, inverse.lin)
     put_base_mat(record, entry, BASE_INVERSE + 9, world, inverse.cross)
     put_base_mat(record, entry, BASE_INVERSE + 18, world, inverse.ang)
@@ -189,7 +189,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return the recorded elimination of a leg's motors from the equations of motion, with `free` 0."""
+    """Return from the record a leg's motor accelerations as a function of the base's acceleration, with `free` 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -199,7 +199,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Write the elimination of a leg's motors from the equations of motion to the record, without `free`."""
+    """Write a leg's motor accelerations as a function of the base's acceleration to the record, without `free`."""
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
@@ -286,7 +286,7 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write a leg's adjoint multipliers (of its motion and of its paw's contact law) to the backward record."""
+    """Write the multipliers of a leg's equations of motion and of its paw's contact law to the record."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 

@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepRecord:
-    """Physics steps between two rows of a rollout, recomputed for its reverse pass; indices: world, step, leg."""
+    """Record of the physics steps between two rows of a rollout, recomputed for the reverse pass."""
 
     base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
     angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
@@ -37,7 +37,7 @@ class StepRecord:
 
 @wp.struct
 class ReplayedStep:
-    """Indices of a step that is recomputed and differentiated, and the wrench on the base in it."""
+    """Indices of a physics step that is recomputed and differentiated, and the wrench on the base in it."""
 
     dt: real  # [s]
     world: int
@@ -49,7 +49,7 @@ class ReplayedStep:
 
 @wp.struct
 class LegReverse:
-    """Working data of a leg in the reverse pass: gradients w.r.t. its motors, multipliers, and its paw's contact.
+    """Values of a leg during the reverse pass: gradients w.r.t. its motors, multipliers, and its paw's contact.
 
     Vectors of motors are lateral, outer, inner.
     """
@@ -231,7 +231,7 @@ def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write each paw's contact and linearised contact law, and the gradient w.r.t. its impulse, to `legs`.
+    """Write each paw's contact, linearised contact law and gradient w.r.t. its impulse to `legs`.
 
     Returns whether any paw touches. m: from `solve_system`. first_impulse: as `Commands.impulse`. cotangent: gradient
     w.r.t. the trajectory.
@@ -271,7 +271,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Add the contact laws' part to the multipliers of the equations of motion.
+    """Add the part of the contact laws to the multipliers of the equations of motion.
 
     Returns those of the base; updates the motors' in `legs`, which holds the laws.
     """

@@ -39,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
-    """Return a scalar for `wp.grad`, the adjoint of `row_base`: cotangent . (base state read from a trajectory row)."""
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `row_base`: cotangent . (base state of a row)."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
         wp.dot(cotangent.pos, base.pos)
@@ -53,7 +53,7 @@ def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, c
 def store_adjoint_scalar(
     orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
 ) -> real:
-    """Return a scalar for `wp.grad`, the adjoint of `store_row_base`: cotangents . (velocities written to a row).
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `store_row_base`: cotangents . (stored velocities).
 
     orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
     """
@@ -63,7 +63,7 @@ def store_adjoint_scalar(
 
 @wp.struct
 class RowCotangent:
-    """Gradient of the loss w.r.t. the base's entries of a trajectory row, see `TrajectoryArrays`; world axes."""
+    """Gradient of the loss w.r.t. the base's entries of a trajectory row, world axes."""
 
     pos: vec3
     quat: quat
@@ -326,7 +326,7 @@ def adjoint_roots(
     factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
     trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Call every function that the reverse pass differentiates, so that Warp generates the adjoints of all of them.
+    """Call every function that the reverse pass differentiates, so that Warp generates all of their adjoints.
 
     Returns a sum of the results, which has no meaning; see `generate_adjoints`.
     """

@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Span:
-    """Range of trajectory rows whose physics steps one launch processes."""
+    """Range of trajectory rows whose physics steps one kernel launch processes."""
 
     begin: int  # first row
     end: int  # excluded
@@ -45,7 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's entry of the first step after a trajectory row; each row has `every` + 1, one for its end."""
+    """Return the index in the record of the first step after a trajectory row; a row has `every` + 1 entries."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -109,7 +109,7 @@ def replay_legs_kernel(
 
 @wp.func
 def load_entries(gradients: Gradients, world: int) -> RowCotangent:
-    """Read the gradient w.r.t. the base's entries of the trajectory row after a span from `gradients.q` and `qd`."""
+    """Read the gradient w.r.t. the base's state in the trajectory row after a span from `gradients.q` and `qd`."""
     entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])

@@ -74,7 +74,7 @@ class LegFactors:
 
 @wp.struct
 class FrameMotion:
-    """Motion and virtual velocity of a link's frame, in its own axes; symbols as in the module's docstring."""
+    """Acceleration, rotation and virtual velocity of a link's frame, in its own axes; symbols: see the module."""
 
     virtual_lin: vec3  # v*
     virtual_ang: vec3  # w*
@@ -107,7 +107,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz): sym(a, b) of the module."""
+    """Return the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz), sym(a, b) of the module."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -297,7 +297,7 @@ def contact_action(
     geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a paw contact's part of the virtual power of a step, which the reverse pass differentiates.
+    """Return the part of a step's virtual power that one paw's contact has, for the reverse pass to differentiate.
 
     It is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
     orientation (xyzw): of the base, world, at the start of the step dt [s].
@@ -385,7 +385,7 @@ def leg_action(
 
 @wp.struct
 class BaseCotangent:
-    """Gradients w.r.t. gravity and velocities that the base's orientation rotates to other axes, for `base_action`."""
+    """Gradients of the loss w.r.t. gravity and velocities of the base, inputs of `base_action`."""
 
     velocity: vec3  # w.r.t. its linear velocity at the start of the step, body axes
     new_velocity: vec3  # w.r.t. its linear velocity at the end of the step, world axes
@@ -422,7 +422,7 @@ def base_action(
 
 @wp.func
 def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
-    """Return a scalar for `wp.grad`, the adjoint of integrating the base's orientation (xyzw) over dt [s].
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of integrating the base's orientation over dt [s].
 
     It is cotangent . (orientation after dt at ang [rad/s], body axes).
     """

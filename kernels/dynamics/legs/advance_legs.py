@@ -53,7 +53,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegState:
-    """State of a thread between physics steps: its leg, and a copy of the base; vectors are lateral, outer, inner."""
+    """State of a thread (leg) between physics steps: motors (lateral, outer, inner), contact, copy of the base."""
 
     base: BaseState
     angles: vec3  # [rad] of its leg's motors
@@ -128,7 +128,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 @wp.struct
 class StopAttempt:
-    """Active set of hard joint stops with which a leg attempts a step, and the rates at which they press."""
+    """Set of hard joint stops with which a leg attempts a step, and the rates beyond which they press."""
 
     stop_rates: StopRates  # zero where no stop is near
     pressed: int
@@ -136,7 +136,7 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the active set of hard joint stops with which a leg attempts a step of dt [s] from the state `old`."""
+    """Return the set of hard joint stops with which a leg attempts a step of dt [s] from the state `old`."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -152,7 +152,7 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
 def required_stops(
     model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
-    """Return the active set of hard joint stops that a leg requires, given the motor rates at which an attempt ended.
+    """Return which hard joint stops a leg must press, given the motor rates at which an attempted step ended.
 
     The attempt had the set `pressed` and ended at `rates` [rad/s]. angles [rad]: at the start of the step. sets: number
     of sets tried. The limits are reloaded to save registers.
@@ -194,7 +194,7 @@ def completed_step(
 
 @wp.func
 def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
-    """Return a thread's state for another attempt at the same physics step, with a revised active set of joint stops.
+    """Return a thread's state to try the same physics step again with another set of pressed joint stops.
 
     From the state `old`; the set is `required`, or one change toward it. pressed: the set just tried. changes: whether
     this leg is the one to change where only one may (`one_by_one`).

@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """Inputs, intermediate and final results of one leg in the solution of a step; motors are lateral, outer, inner."""
+    """Inputs and results of one leg in the solution of a physics step; motors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s] at the start of the step
