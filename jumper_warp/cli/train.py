@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
-PRESET_STEPS_PER_SECOND = 14_000.0  # [1/s] Policy steps on two cores with a preset, of all worlds
+PRESET_STEPS_PER_SECOND = 20_000.0  # [1/s] Policy steps on two cores with a preset, of all worlds
 SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
 SHORT_HELP = {
     "Size and length": ("preset", "num-envs", "max-iterations", "max-seconds", "seed"),
