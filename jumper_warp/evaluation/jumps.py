@@ -368,7 +368,7 @@ class JumpLog(EvaluationLog):
         return {"phase/{}": np.array(PHASES)[self.arrays["phase"]]}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw: commanded heights of all worlds, or goals in the world frame with z = 0."""
+        """Return the markers of a recording: commanded heights [m], or goals in the world frame with z = 0."""
         if self.to_heights:
             return {"heights": self.goals[:, 0, 2]}
         return {"goals": np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))}

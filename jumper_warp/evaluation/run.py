@@ -206,7 +206,7 @@ class Run(ABC):
     def report(
         self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
     ) -> dict[str, Any]:  # fmt: skip
-        """Write all metrics, print those with the given keys beside the paper's values, and return the values."""
+        """Write all metrics to `metrics.json`, print those with the given keys, and return all values by name."""
         values = self.write(metrics)
         ends = [key for key in metrics if key.startswith("ended_by_")]
         ends = sorted(ends, key=lambda key: metrics[key].value or 0.0, reverse=True)[:MOST_ENDS]  # pyright: ignore

@@ -72,7 +72,7 @@ class Recorder:
         states: Mapping[str, str] | None = None,
         commands: np.ndarray | None = None,
     ) -> None:
-        """Add a frame at a time [s] after the previous frame's.
+        """Record the current state as a frame; its time stamp [s] must be later than that of the previous frame.
 
         body_poses: of all bodies of the model, like `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
         series: values by name, `group/quantity [unit]`, the same names in every frame. contact_points [m] and

@@ -56,7 +56,7 @@ class GroundCfg:
 
     @property
     def drawn(self) -> bool:
-        """Whether platforms or blocks are ever sampled."""
+        """Whether resets sample platforms or blocks as the ground of robots."""
         return self.platform + self.block > 0.0
 
     def ranges(self) -> Any:

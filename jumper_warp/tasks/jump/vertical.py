@@ -79,7 +79,7 @@ RESET = ResetCfg(
 
 
 def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
-    """Return a curriculum of ranges (lowest, highest) of apex heights of the base [m], each with all `STARTS`."""
+    """Return curriculum levels: each range of commanded apex heights [m], with each range of start heights."""
     return cross_levels([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
 
 
