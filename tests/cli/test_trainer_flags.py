@@ -35,7 +35,7 @@ def test_flags_that_rsl_rl_uses_are_accepted():
 
 def test_preset_leaves_out_flags_that_the_trainer_does_not_use(capsys):
     cfg = parse_train("vertical-jump --preset laptop --trainer rsl-rl".split())[0].cfg
-    assert (cfg.num_envs, cfg.ppo.hidden, cfg.max_iterations) == (1024, (128, 64, 64), 140)
+    assert (cfg.num_envs, cfg.ppo.hidden, cfg.max_iterations) == (1024, (128, 64, 64), 200)
     assert cfg.ppo.final_desired_kl == PpoCfg().final_desired_kl
     assert "final-desired-kl" not in capsys.readouterr().err
     cfg = parse_train("vertical-jump --preset laptop".split())[0].cfg
