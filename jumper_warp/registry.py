@@ -52,6 +52,11 @@ class TaskEntry:
         return self.make.split(":")[0] if isinstance(self.make, str) else self.make.__module__
 
     @property
+    def of_project(self) -> bool:
+        """Whether the task is one of the project's own, not of a user."""
+        return self.origin.startswith(PROJECT_PREFIX)
+
+    @property
     def description(self) -> str:
         """Short description of the task: `about`, or the first sentence of the factory's docstring.
 
@@ -82,7 +87,7 @@ class TaskEntry:
         try:
             task = make()
         except (InputError, TypeError) as error:
-            if self.origin.startswith(PROJECT_PREFIX):
+            if self.of_project:
                 raise
             code = getattr(inspect.unwrap(make), "__code__", None)
             raise own_fault(error, code.co_filename if code else "") from error
@@ -247,11 +252,6 @@ def task_name(name: str) -> str | None:
     """
     installed = {dashed(point.name): point.name for point in installed_tasks()}
     return (installed | _tasks_by_name()).get(dashed(name))
-
-
-def of_project(name: str) -> bool:
-    """Return whether a task, by its registered name, is one of the project's own, not of a user."""
-    return name in TASKS and TASKS[name].origin.startswith("jumper_warp.")
 
 
 def find_task(name: str) -> tuple[str, TaskEntry]:

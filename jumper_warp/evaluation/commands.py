@@ -60,7 +60,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     from jumper_warp.evaluation.trained import trained_success
     from jumper_warp.policies.folder import add_files
     from jumper_warp.policies.runs import is_run
-    from jumper_warp.registry import of_project
+    from jumper_warp.registry import TASKS
 
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
@@ -71,7 +71,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
     run.run_episodes(run.env(log.count), log)
     metrics = cfg.flags.metrics(log) | trained_success(run.task, log)
-    values = run.report(metrics, run.evaluation.paper if of_project(run.task.name) else {})
+    entry = TASKS.get(run.task.name)
+    values = run.report(metrics, run.evaluation.paper if entry and entry.of_project else {})
     if cfg.save_to_policy:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
         add_files(find_policy(run.source), files)

@@ -57,6 +57,30 @@ def test_metrics_refused_by_a_full_disk_are_appended_later_in_order(tmp_path):
     assert iterations(path) == [1, 2, 3, 4]
 
 
+class Untruncated:
+    """Open file that cannot be shortened."""
+
+    def __init__(self, file):
+        self.write = file.write
+
+    def truncate(self, size):
+        """Raise OSError."""
+        raise OSError("cannot be shortened")
+
+
+def test_partial_line_that_could_not_be_removed_is_removed_before_the_next_one(tmp_path, monkeypatch):
+    path = tmp_path / METRICS_FILE
+    file = MetricsFile(path, 0)
+    file.add(1, {})
+    size = path.stat().st_size
+    with monkeypatch.context() as patch, full_disk(size + 5), pytest.raises(OSError, match="too large"):
+        patch.setattr(file, "_file", Untruncated(file._file))
+        file.add(2, {})
+    assert path.stat().st_size == size + 5  # bytes
+    file.add(3, {})
+    assert iterations(path) == [1, 2, 3]
+
+
 class DiskFillingTask(PushTask):
     """Task that makes the disk full while the metrics of the second and third iteration are logged."""
 
