@@ -1,15 +1,16 @@
-"""Measure how soon the vertical jump is learnt, for seeds and trainer variants, and write metrics and a plot.
+"""Measure how soon a jump is learnt, for seeds and trainer variants, and write metrics and a plot.
 
     python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default eager
     python experiments/learning_curves.py --device cpu --num-envs 2048 --history 1 --variants small \
-        --height-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
+        --goal-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
     python experiments/learning_curves.py --iterations 570 --seeds 0 1 2 3 4 5 6 7 --variants default eager --workers 4
 
 Trainings start from random weights, one after the other, each in a separate process. Every few seconds of training time
-the policy is evaluated on jumps to heights of 0.5 to 1.1 m. The metrics are the training times to success rates up to
-100 %, and the time from the start of the process to the start of the training, when everything is compiled. A second
-process loads compiled kernels from the caches on disk. Variants are those of `support.variants`. Two variants are
-compared by rank tests. With `--iterations` all trainings have the same number of samples, and several can run at once.
+the policy is evaluated on jumps to heights of 0.5 to 1.1 m, or to places 0.3 to 1.5 m ahead. The metrics are the
+training times to success rates up to 100 %, and the time from the start of the process to the start of the training,
+when everything is compiled. A second process loads compiled kernels from the caches on disk. Variants are those of
+`support.variants`. Two variants are compared by rank tests. With `--iterations` all trainings have the same number of
+samples, and several can run at once.
 """
 
 from __future__ import annotations
@@ -26,17 +27,16 @@ from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.learning import TEST_HEIGHTS, LearningCurve, compare, curve_metrics, plot_curves, train_and_time
+from support.learning import TEST_RANGES, LearningCurve, compare, curve_metrics, plot_curves, train_and_time
 from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 from support.variants import DEFAULT, variant
-
-TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
     """Flags of the measurement of learning curves."""
 
+    task: str = "vertical-jump"  # Task of jumps to heights or to places
     seconds: float = 60.0  # [s] Time of each training, its evaluations not counted
     iterations: int = 0  # Number of iterations of each training instead of a time; 0: `seconds` counts
     workers: int = 1  # Number of trainings at once; more than one needs `iterations`
@@ -45,14 +45,17 @@ class Args(DeviceArgs):
     variants: tuple[str, ...] = (DEFAULT,)  # Variants of the trainer (`support.variants`)
     num_envs: int = 8192  # Number of environments
     num_jumps: int = 200  # Number of jumps of an evaluation
-    height_range: tuple[float, float] = TEST_HEIGHTS  # [m] Lowest and highest commanded base height
+    goal_range: tuple[float, float] | None = None
+    """[m] Lowest and highest commanded base height, or smallest and largest distance ahead (default: `TEST_RANGES`)."""
     history: int | None = None
     """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
     randomize: bool = False  # Train with randomisation and noise
 
     def __post_init__(self) -> None:
+        if (suite := make_task(self.task).evaluation_suite) not in TEST_RANGES:
+            raise InputError(f"{self.task} is no jump: its evaluation is {suite}")
         for name in self.variants:
-            variant(trainer_settings(TASK), name)
+            variant(trainer_settings(self.task), name)
         if not self.variants or not self.seeds or min(self.seeds) < 0:
             raise InputError("at least one variant and one seed of 0 or more are needed")
         if self.seconds <= 0.0 or self.eval_interval <= 0.0:
@@ -64,7 +67,8 @@ class Args(DeviceArgs):
 def train(args: Args, name: str, seed: int) -> LearningCurve:
     """Train the trainer's variant `name` with a seed, and return the learning curve."""
     wp.config.log_level = wp.LOG_WARNING
-    task, cfg = with_history(make_task(TASK), args.history), variant(trainer_settings(TASK), name)
+    task = with_history(make_task(args.task), args.history)
+    cfg = variant(trainer_settings(args.task), name)
     return train_and_time(task, cfg, args, seed)
 
 
@@ -78,8 +82,9 @@ def main(args: Args) -> dict[str, Any]:
     """Train every variant with every seed, write metrics and plot after each, and return the metrics."""
     folder = prepare("learning_curves", args)
     length = {"iterations": args.iterations} if args.iterations else {"seconds": args.seconds}
-    values: dict[str, Any] = {**length, "envs": args.num_envs, "randomize": args.randomize}
-    values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
+    values: dict[str, Any] = {"task": args.task, **length, "envs": args.num_envs, "randomize": args.randomize}
+    limits = args.goal_range or TEST_RANGES[make_task(args.task).evaluation_suite]
+    values |= {"seeds": list(args.seeds), "goals_m": list(limits), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
     runs = [*itertools.product(args.variants, args.seeds)]
     with ThreadPoolExecutor(args.workers) as pool:
@@ -96,7 +101,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= compare(first, second)
         write_metrics(folder, values)
     keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_", "p_"))]
-    return report(args, folder, values, f"Learning curves of {TASK}, {args.num_envs:,} environments", keys)
+    return report(args, folder, values, f"Learning curves of {args.task}, {args.num_envs:,} environments", keys)
 
 
 if __name__ == "__main__":

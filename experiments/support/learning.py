@@ -1,4 +1,4 @@
-"""Learning curves: success of a policy at jumps to heights over its training time."""
+"""Learning curves: success of a policy at jumps over its training time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported
 EVALUATIONS = 40  # Number of evaluations of a training with a given number of iterations
-TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated jumps
+TEST_RANGES = {"apex_height": (0.5, 1.1), "landing_position": (0.3, 1.5)}
+"""Default ranges [m] of the heights, or distances ahead, of evaluated jumps by the task's `evaluation_suite`."""
 
 
 @dataclass
@@ -51,16 +52,23 @@ def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
     return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 
-def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> JumpLog:
-    """Run one jump per world to commanded heights [m], (num_envs,), return the log; act: see `run_evaluation`."""
-    jumps = JumpLog(heights, env.task.termination_names)
+def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, goals: np.ndarray) -> JumpLog:
+    """Run one jump per world to commanded goals [m], as `JumpLog` takes them; act: see `run_evaluation`."""
+    jumps = JumpLog(goals, env.task.termination_names)
     run_evaluation(act, env, jumps)
     return jumps
 
 
-def success_rate(trainer: Ppo | Shac, eval_env: Env, heights: tuple[float, float] = TEST_HEIGHTS) -> float:
-    """Return the success rate [1] of jumps to evenly spaced heights between limits [m], one per world of `eval_env`."""
-    return float(run_jumps(trainer.model.act, eval_env, np.linspace(*heights, eval_env.num_envs)).success.mean())
+def success_rate(trainer: Ppo | Shac, eval_env: Env, limits: tuple[float, float] | None = None) -> float:
+    """Return the success rate [1] of jumps to evenly spaced heights, or places ahead, one per world of `eval_env`.
+
+    limits [m]: lowest and highest height or distance; None: those of TEST_RANGES.
+    """
+    suite, count = eval_env.task.evaluation_suite, eval_env.num_envs
+    goals = np.linspace(*(limits or TEST_RANGES[suite]), count)
+    if suite == "landing_position":
+        goals = np.stack([goals, np.zeros(count)], axis=1)[:, None]
+    return float(run_jumps(trainer.model.act, eval_env, goals).success.mean())
 
 
 def warm_up(env: VecEnv, trainer: Ppo | Shac) -> None:
@@ -74,13 +82,13 @@ def warm_up(env: VecEnv, trainer: Ppo | Shac) -> None:
 
 def train_and_evaluate(
     env: VecEnv, trainer: Ppo | Shac, eval_env: Env, length: float, every: float,
-    heights: tuple[float, float] = TEST_HEIGHTS, by_iterations: bool = False,
+    limits: tuple[float, float] | None = None, by_iterations: bool = False,
 ) -> LearningCurve:  # fmt: skip
     """Train as `jumper train --max-seconds` or `--max-iterations` does, and return the learning curve.
 
     Compilation (`warm_up`) and evaluations do not count as training time.
     env: environment of the training, not yet reset; eval_env: one world per evaluated jump; length: of the training,
-    and every: between two evaluations, [s] or number of iterations; heights [m]: range of the evaluated jumps.
+    and every: between two evaluations, [s] or number of iterations; limits [m]: see `success_rate`.
     """
     warm_up(env, trainer)
     curve, trained, spent, device = LearningCurve(), 0.0, 0.0, wp.device_from_torch(env.device)
@@ -96,7 +104,7 @@ def train_and_evaluate(
             spent = float(curve.iterations) if by_iterations else trained
         curve.seconds.append(trained)
         curve.steps.append(curve.iterations * trainer.batch_size)
-        curve.success.append(success_rate(trainer, eval_env, heights))
+        curve.success.append(success_rate(trainer, eval_env, limits))
     return curve
 
 
@@ -114,7 +122,7 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     length, every = args.seconds, args.eval_interval
     if args.iterations:
         length, every = args.iterations, max(1, args.iterations // EVALUATIONS)
-    curve = train_and_evaluate(env, trainer, eval_env, length, every, args.height_range, bool(args.iterations))
+    curve = train_and_evaluate(env, trainer, eval_env, length, every, args.goal_range, bool(args.iterations))
     curve.ready = ready
     return curve
 

@@ -183,7 +183,7 @@ def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variant
     monkeypatch.setattr(learning_curves, "train_in_process", train)
     args = learning_curves.Args(
         seconds=0.3, eval_interval=0.2, seeds=(0, 1), variants=("eager",), num_envs=8, num_jumps=2, history=1,
-        height_range=(0.5, 0.9), out=tmp_path, device="cpu",
+        goal_range=(0.5, 0.9), out=tmp_path, device="cpu",
     )  # fmt: skip
     values = learning_curves.main(args)
     assert values == read_values(tmp_path)
@@ -192,7 +192,7 @@ def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variant
     assert values["seconds_to_95_percent_eager_1"] == 4.0 and values["ready_s_eager_1"] == 3.0
     assert values["steps_to_95_percent_eager_1"] == 20
     assert values["seconds_to_100_percent_eager_1"] is None
-    assert values["history"] == 1 and values["heights_m"] == [0.5, 0.9]
+    assert values["history"] == 1 and values["goals_m"] == [0.5, 0.9]
     assert (tmp_path / "learning_curves.png").is_file()
     with pytest.raises(InputError, match=r"variants are default, .*, got 'faster'"):
         replace(args, variants=("faster",))

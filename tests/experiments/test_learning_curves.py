@@ -3,6 +3,7 @@
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -41,8 +42,8 @@ def env():
 def test_timed_training_sets_progress_from_0_to_1_without_evaluation_time(env, monkeypatch):
     evaluated = []
 
-    def evaluate(trainer, eval_env, heights):
-        evaluated.append(heights)
+    def evaluate(trainer, eval_env, limits):
+        evaluated.append(limits)
         time.sleep(0.05)
         return 0.5
 
@@ -61,6 +62,28 @@ def test_training_of_a_number_of_iterations_is_evaluated_at_equal_steps(env, mon
     curve = train_and_evaluate(env, trainer, None, 5, 2, by_iterations=True)
     assert trainer.progress == [0.0, 0.2, 0.4, 0.6, 0.8]
     assert (curve.iterations, curve.steps) == (5, [128, 256, 320])
+
+
+@pytest.mark.parametrize(
+    ("suite", "limits", "goals"),
+    [
+        ("apex_height", None, [[0.0, 0.0, 0.5], [0.0, 0.0, 0.8], [0.0, 0.0, 1.1]]),
+        ("landing_position", None, [[0.3, 0.0, 0.0], [0.9, 0.0, 0.0], [1.5, 0.0, 0.0]]),
+        ("landing_position", (1.0, 2.0), [[1.0, 0.0, 0.0], [1.5, 0.0, 0.0], [2.0, 0.0, 0.0]]),
+    ],
+)
+def test_evaluated_jumps_are_to_heights_or_to_places_ahead(suite, limits, goals, monkeypatch):
+    logs = []
+
+    def jump(act, env, jumps):
+        logs.append(jumps.goals)
+        jumps.end[:] = jumps.terminations.index("success")
+
+    monkeypatch.setattr(learning, "run_evaluation", jump)
+    task = SimpleNamespace(evaluation_suite=suite, termination_names=("success",))
+    trainer = SimpleNamespace(model=SimpleNamespace(act=None))
+    assert learning.success_rate(trainer, SimpleNamespace(task=task, num_envs=3), limits) == 0.0  # never at rest
+    np.testing.assert_allclose(logs[0][:, 0], goals)
 
 
 def test_reached_returns_first_evaluation_with_the_rate():
