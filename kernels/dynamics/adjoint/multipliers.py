@@ -65,7 +65,7 @@ class LegReverse:
 
 @wp.struct
 class Multipliers:
-    """Multipliers of the base's equations of motion in a step, and the gradients from which they are solved.
+    """Adjoint multipliers of the base's equations of motion in a step, and the gradients they are solved from.
 
     The multipliers are m, the gradients y in M m = y (M: mass matrix); body axes.
     """
@@ -271,7 +271,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Add the part of the contact laws to the multipliers of the equations of motion.
+    """Add the contribution of the paws' contact laws to the multipliers of the equations of motion.
 
     Returns those of the base; updates the motors' in `legs`, which holds the laws.
     """

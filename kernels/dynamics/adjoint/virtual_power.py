@@ -397,7 +397,7 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base's part of a step's virtual power, plus `cotangent` . (gravity and velocities in rotated axes).
+    """Return the base's part of a step's virtual power, plus dot(`cotangent`, gravity and velocities in rotated axes).
 
     gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
     axes; orientation: xyzw.
