@@ -1,4 +1,4 @@
-"""Estimate of a training's memory, and its check before anything is built."""
+"""Estimate of the memory that a training needs, compared with the free memory before anything is built."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Metric(NamedTuple):
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit in the name of a metric, such as m/s for `..._m_s` or `... [m/s]`; None: no unit, as a count."""
+    """Return the unit in the name of a metric, such as m/s for `speed_m_s` or `speed [m/s]`; None: none, as a count."""
     return split_unit(key)[1]
 
 

@@ -60,7 +60,7 @@ class Composition:
 
     @property
     def stays(self) -> bool:
-        """Whether the robot stays in place: the picture's horizontal axis is time, in the order of the moments."""
+        """Whether the robot stays in place, so that the picture's horizontal axis is time, in order of the moments."""
         return bool(self.shift.any())
 
     @property
