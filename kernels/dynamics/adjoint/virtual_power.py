@@ -42,7 +42,7 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """Multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
+    """Adjoint multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
 
     Axes are those of the base at the start of the step.
     """
@@ -57,7 +57,7 @@ class BaseFactors:
 
 @wp.struct
 class LegFactors:
-    """Multipliers, motor motion and contact of a leg, held constant while its virtual power is differentiated.
+    """Adjoint multipliers, motor motion and contact of a leg, constant while its virtual power is differentiated.
 
     Vectors are lateral, outer, inner, or those of its paw's contact.
     """
