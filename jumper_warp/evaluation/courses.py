@@ -287,7 +287,7 @@ class CourseLog(EvaluationLog):
         return {"skill/{}": np.array(NAMES)[self.skills[-1]]}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw of all robots: goals of their jumps, NaN if none, and commanded velocities."""
+        """Return the markers of a recording: goals of all robots' jumps, NaN if none, and commanded velocities."""
         goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
         return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 

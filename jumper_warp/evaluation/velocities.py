@@ -179,7 +179,7 @@ class VelocityLog(EvaluationLog):
         return self.commands
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw: the current commanded velocities of all robots."""
+        """Return the markers of a recording: the current commanded velocities of all robots."""
         return {"commands": self.command_history()[-1]}
 
 

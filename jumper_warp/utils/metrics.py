@@ -73,7 +73,7 @@ def split_unit(key: str) -> tuple[str, str | None]:
 def measure(
     table: Iterable[Metric], outcome: Outcome, where: np.ndarray | None = None, prefix: str = "", note: str = ""
 ) -> Metrics:
-    """Compute the metrics that a table defines from the results of an evaluation.
+    """Compute metrics, given by their definitions, from the results of an evaluation.
 
     Returned by key, each with `prefix` before it. where: mask of the trials to use, default: all; note: description of
     these trials, for the file.

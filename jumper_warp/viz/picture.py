@@ -1,4 +1,4 @@
-"""Composite pictures: one scene with the robot at several times of a recording, and marks of heights and goals."""
+"""Composite pictures: one scene with the robot at several times of a recording, and markers of heights and goals."""
 
 from __future__ import annotations
 
