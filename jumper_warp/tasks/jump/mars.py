@@ -26,7 +26,7 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return motor settings of jumps on Mars: transversal kp KP, limit TORQUE; lateral_torque: lateral limit [N m]."""
+    """Return motors for jumps on Mars: transversal kp and torque limit of the sequel; lateral_torque: limit [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 
