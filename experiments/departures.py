@@ -1,4 +1,4 @@
-"""Train jumps without one departure from the paper each, and write metrics, a table, a plot and the trainings' runs.
+"""Train jump tasks with one departure from the paper undone at a time, and write metrics, a table, a plot and runs.
 
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
@@ -31,7 +31,7 @@ from support.scripts import ThreadArgs, announce, prepare, report, run_script, t
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the trainings without one departure from the paper each."""
+    """Flags of the trainings with one departure from the paper undone at a time."""
 
     task: JumpTask = "vertical-jump"  # Task whose departures are undone
     only: tuple[str, ...] = ()  # Names of the departures to undo, or kept for none (default: all)

@@ -34,7 +34,7 @@ HEADER = "| fault | times | iterations repeated, most | trials | unequal or unex
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the fault campaign."""
+    """Flags of the test of training under injected faults."""
 
     trials: int = 60  # Number of trials, over all starts with the same --out
     max_seconds: float = 480.0  # [s] Time after which no further trial starts; one takes some 5 s on two free cores
@@ -50,7 +50,7 @@ class Args(OutputArgs):
 
 
 def read_trials(folder: Path, seed: int) -> list[dict[str, Any]]:
-    """Return the trials in a campaign's folder. Raises InputError: they have another seed."""
+    """Return the results of all trials in a campaign's folder. Raises InputError: they have another seed."""
     path = folder / LOG
     trials = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     if any(trial["seed"] != seed for trial in trials):
@@ -85,7 +85,7 @@ def write_tables(folder: Path, trials: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the trials that are left, as far as the time allows, and return metrics of all trials."""
+    """Run the trials missing in the output folder until the time limit, and return metrics of all trials."""
     start, folder = time.monotonic(), output_dir("fault_campaign", args.out).absolute()
     with write_lock(folder):
         trials = read_trials(folder, args.seed)

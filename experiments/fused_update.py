@@ -76,7 +76,7 @@ class RandomEnv:
             self.reward.normal_()
 
     def reset(self) -> None:
-        """Do nothing."""
+        """Do nothing, since random observations need no reset."""
 
     def mirror(self, what: str) -> tuple[list[int], list[float]]:
         """Return a mirror map (order, signs) that exchanges neighbours and negates every other pair."""

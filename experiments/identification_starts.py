@@ -41,7 +41,7 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the test of the starts of identification."""
+    """Flags of the test of identification on robots far from their description."""
 
     num_robots: int = 40  # Number of robots
     num_noises: int = 3  # Number of recordings of each robot
@@ -58,7 +58,7 @@ class Args(OutputArgs):
 
 
 def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
-    """Return the fits in a file of JSON lines by (robot, noise); a last line that was cut off is dropped."""
+    """Return the fits in a file of JSON lines by (index of robot, index of noise); a last line cut short is dropped."""
     fits = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
         try:
@@ -70,7 +70,7 @@ def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
 
 
 def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return metrics of all fits: accepted and good ones, coverage and time."""
+    """Return metrics of all fits: numbers of accepted and good ones, coverage of 95 % intervals, and CPU time."""
     accepted, good = ([fit for fit in fits if fit[name]] for name in ("consistent", "good"))
     bad = [fit for fit in accepted if not fit["good"]]
     cpu = [fit["cpu_s"] for fit in fits]

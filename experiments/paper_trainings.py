@@ -1,4 +1,4 @@
-"""Train the paper's tasks and the ablations of its thesis, test them as the paper did, and write a metric file per arm.
+"""Train the paper's tasks and the ablations of its thesis, test them as the paper did, and write metrics of each.
 
     python experiments/paper_trainings.py --tasks vertical-jump-paper --arms full --seeds 0 --out outputs/paper
     python experiments/paper_trainings.py --table --out outputs/paper     # table and curves so far
@@ -64,14 +64,14 @@ class Args(ThreadArgs):
             raise InputError("num_jumps and save_interval must be at least 1, seeds at least 0")
 
     def trainings(self) -> Iterator[tuple[str, str, int]]:
-        """Yield (task, arm, seed) of each training, the first seed of every arm first."""
+        """Yield (task, ablation or "full", seed) of each training, the first seed of every ablation first."""
         for seed in self.seeds:
             for name in self.tasks:
                 walks = make_task(name).evaluation_suite == "velocity"
                 yield from ((name, arm, seed) for arm in self.arms if arm == FULL or not walks)
 
     def command(self, name: str, arm: str, seed: int, folder: Path) -> list[str]:
-        """Return the arguments of `jumper train` of an arm; folder: of the arm."""
+        """Return the arguments of `jumper train` for a task, an ablation (arm) and a seed; folder: root of the logs."""
         flags = f"--seed {seed} --save-interval {self.save_interval} --max-checkpoints 1000 --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
@@ -80,7 +80,7 @@ class Args(ThreadArgs):
 
 
 def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[str, Any]:
-    """Train and test one arm in its folder, unless it is finished; return its metrics by name."""
+    """Train and test a task with an ablation (arm) and a seed, unless `folder` has the results; return them by name."""
     primary = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation_suite]}"
     jumps = not primary.startswith(f"{NOMINAL}_walk")
     if (folder / "metrics.json").exists() and (values := read_values(folder)).get(primary) is not None:
@@ -105,7 +105,7 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the arms one after the other, print the table and plot the curves of all; return primary metrics by arm."""
+    """Run all trainings in turn, print the table and plot the learning curves; return the primary metric of each."""
     folder, results = prepare("paper_trainings", args, args.threads), {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")

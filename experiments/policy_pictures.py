@@ -89,7 +89,7 @@ SHOTS = {
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the drawing of policies."""
+    """Flags of the script that draws pictures and films of policies."""
 
     policies: tuple[str, ...] = (*SHOTS, COURSE)  # Names of the policies to draw
     films: bool = True  # Also make films
@@ -103,7 +103,7 @@ class Args(ThreadArgs):
 
 
 def record(name: str) -> Recording:
-    """Simulate and record one episode of a policy's motion for its picture, or of the course of three policies."""
+    """Simulate one episode of a policy for its picture, or the course of three policies, and return the recording."""
     if name == COURSE:
         run, log = SkillRun(), CourseLog([read_script(SCRIPT)])
         env, ground = run.env(1), "plane"
@@ -140,7 +140,7 @@ def main(args: Args) -> dict:
 
 
 def save_tile(paths: list[Path], path: Path) -> None:
-    """Write pictures in two columns, each below the shorter one; the longer column is cut at the bottom."""
+    """Write one picture of several in two columns, each added to the shorter column; the longer one is cut off."""
     columns, heights = ([], []), [0, 0]
     for each in paths:
         picture = Image.open(each).convert("RGB")

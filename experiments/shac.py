@@ -60,7 +60,7 @@ class Args(DeviceArgs):
 
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
-    """Return an environment of the nominal task; history: policy steps in the observation, None: the task's."""
+    """Return an environment of TASK without randomisation and noise; history: observed policy steps, None: default."""
     task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 

@@ -66,7 +66,7 @@ class TaskEntry:
         return self.about or first_sentence(doc)
 
     def training(self, name: str) -> TrainCfg:
-        """Return the default settings of a training; name: of the task."""
+        """Return the default settings with which the task is trained; name: of the task."""
         return TrainCfg(
             task=name, num_envs=self.num_envs, max_iterations=self.max_iterations, best_metric=self.best_metric,
             ppo=self.ppo,
@@ -80,7 +80,7 @@ class TaskEntry:
         return getattr(importlib.import_module(module), function)
 
     def task(self, name: str) -> TaskCfg:
-        """Make and return the task. Raises InputError: it is invalid, no TaskCfg, or has another name."""
+        """Return the task that the factory makes. Raises InputError: it is invalid, no TaskCfg, or has another name."""
         from jumper_warp.tasks.cfg import TaskCfg
 
         make = self.factory()

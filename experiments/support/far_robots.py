@@ -40,13 +40,13 @@ def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def is_good(error: np.ndarray) -> np.ndarray:
-    """Return whether fits are good, (...); error: of identified parameters, in standard deviations, (..., P)."""
+    """Return whether fits are good, (...): few errors (..., P) [standard deviations] beyond 95 % limits, none far."""
     outside = (error > CONFIDENCE).mean(axis=-1)
     return (outside <= MOST_OUTSIDE) & (error.max(axis=-1) <= FARTHEST_OUTSIDE)
 
 
 def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Generator) -> float:
-    """Return the probability that a fit in the right minimum is bad by chance, from `DRAWS` normal errors.
+    """Return the probability that a fit in the right minimum fails `is_good` by chance, from `DRAWS` sampled errors.
 
     An error common to many parameters leaves many intervals at once. With the covariance C of the posterior, and the
     unit prior at 0, the estimate of a robot z has mean z - C z and covariance C - C C. truth: z, (P,).

@@ -87,7 +87,7 @@ class Trial:
         return code
 
     def operation(self, start: float = 0.0, end: float = 1.0) -> int:
-        """Return the number of a random file operation in the rest of the training, within fractions of all."""
+        """Return the number of a random file operation between fractions `start` and `end` of the training's rest."""
         total, done = reference(self.training_seed, 1, self.folder.parent).operations, self.saved_iteration()
         rest = total * (1.0 - done / faults.ITERATIONS)
         return 1 + int(rest * self.rng.uniform(start, end))
@@ -203,7 +203,7 @@ def small_disk(folder: Path) -> Iterator[None]:
 
 
 def disturb(trial: Trial, name: str, begin: Action, end: Action, prepare: Action = lambda: None) -> None:
-    """Disturb a training from one file operation to another one or beyond its end (exit code 2), then let it finish."""
+    """Run a training with a disturbance from a random file operation to a later one or to the end; then finish it."""
     passes = bool(trial.rng.integers(2))
     first = trial.operation(0.1, 0.9)
     last = first + int(trial.rng.integers(1, 40))

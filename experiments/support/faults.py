@@ -92,7 +92,7 @@ def wait(pid: int) -> int:
 
 
 def on_file_operations(root: Path, actions: Mapping[int, Action]) -> Callable[[], int]:
-    """Call each action before the file operation below a folder with its number; return the function that counts them.
+    """Call actions before numbered file operations below a folder; return a function that counts the operations.
 
     The first operation is number 1. It lasts until the process ends.
     """
@@ -136,7 +136,7 @@ def launch_ranks(job: Callable[[], None], ranks: int, restarts: int) -> None:
 
 
 def train(args: Sequence[str]) -> None:
-    """Run the small training with more arguments."""
+    """Run `jumper train` in this process with the small training `TRAIN` and more arguments."""
     main([*TRAIN, *args])
 
 

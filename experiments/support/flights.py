@@ -172,7 +172,7 @@ class FlightLog(EvaluationLog):
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each robot landed and was within UPRIGHT of level AFTER seconds later, (num_envs,)."""
+        """Whether each robot landed and was nearly level (within UPRIGHT) AFTER seconds later, (num_envs,)."""
         return self.end == OUTCOMES.index("landed")
 
     @property

@@ -48,7 +48,7 @@ class LearningCurve:
 
 
 def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
-    """Return a nominal environment of `jumps` worlds to evaluate policies of a task, without noise and link margins."""
+    """Return a nominal environment of `jumps` worlds, without noise and collision margins, to evaluate policies."""
     return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 

@@ -1,4 +1,4 @@
-"""Arms of `experiments/paper_trainings.py`: flags of the ablations, the paper's tests, and the learning curve."""
+"""Ablations (arms) of `experiments/paper_trainings.py`: their flags, the paper's tests, and the learning curve."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ RATE = 0.5  # [1] Success rate whose number of steps is the second primary metri
 
 
 def arm_flags(task: TaskCfg, arm: str) -> list[str]:
-    """Return the flags of `jumper train` that make an arm of a task; none for FULL and for walking.
+    """Return the flags of `jumper train` that make an ablation (arm) of a task; none for FULL and for walking.
 
     Without initialisation every episode starts in the default pose. Without estimates neither rewards nor terminations
     use them. Without curriculum all levels are the last.
@@ -72,7 +72,7 @@ def arm_flags(task: TaskCfg, arm: str) -> list[str]:
 
 
 def train_arm(arguments: Sequence[str]) -> tuple[Path, int]:
-    """Train, or continue the training in its log folder; arguments: of `jumper train`.
+    """Train a policy, or continue the training in its log folder; arguments: of `jumper train`.
 
     Returns the run's folder, and the number of policy steps of all worlds in an iteration.
     """
@@ -90,7 +90,7 @@ def goals_of_test(test: str, num_jumps: int) -> np.ndarray:
 
 
 def make_log(task: TaskCfg, test: str, num_jumps: int) -> EvaluationLog:
-    """Return a new log of a test; jumps to places are commanded at once, since their goals are always observed."""
+    """Return a new log of a test of the paper; jumps to places are commanded at once, as goals are always observed."""
     if test == "sweep":
         return JumpLog(np.linspace(*HEIGHTS, num_jumps), task.termination_names)
     if test == "walk":
@@ -113,7 +113,7 @@ def metrics_of(run: EvaluationRun, log: EvaluationLog) -> Metrics:
 
 
 def evaluate_arm(checkpoint: Path, folder: Path, num_jumps: int, conditions: Conditions) -> Metrics:
-    """Run the paper's tests with nominal and with randomised, noisy robots; keys: `<robots>_<test>_<metric>`."""
+    """Run the paper's tests of a policy on nominal and noisy, randomised robots; keys: `<robots>_<test>_<metric>`."""
     run, metrics = EvaluationRun(checkpoint), {}
     run.prepare("paper_trainings", conditions, folder)
     for robots in (NOMINAL, RANDOMIZED):

@@ -41,13 +41,13 @@ CURVES = (
 
 
 def finished(folder: Path, task: str, arm: str) -> list[dict[str, Any]]:
-    """Return the metrics of the finished trainings of an arm by seed."""
+    """Return the metrics of all finished trainings of a task with an ablation (arm), one dict per seed."""
     files = sorted((folder / task).glob(f"{arm}_*/metrics.json"))
     return [values for path in files if "curve_steps" in (values := read_values(path.parent))]
 
 
 def cell(folder: Path, task: str, arm: str, key: str) -> str:
-    """Return mean and range over the seeds of a metric of an arm; GAP: no seed has it, NEVER: no seed reached it."""
+    """Format a metric of an ablation (arm), mean and range over seeds; GAP: no seed has it, NEVER: none reached it."""
     seeds = finished(folder, task, arm)
     found = [values[key] for values in seeds if values.get(key) is not None]
     if not found:
@@ -58,7 +58,7 @@ def cell(folder: Path, task: str, arm: str, key: str) -> str:
 
 
 def results_table(folder: Path) -> str:
-    """Return the table of all arms in a folder of `experiments/paper_trainings.py`."""
+    """Return a Markdown table of the paper's results and those of all ablations that were trained in a folder."""
     lines = [f"| task | test | paper | {' | '.join(arm.replace('_', ' ') for arm in ARMS)} |", "|---" * 7 + "|"]
     for task, words, key, paper in ROWS:
         arms = ARMS if task != "velocity-paper" else ARMS[:1]
@@ -68,7 +68,7 @@ def results_table(folder: Path) -> str:
 
 
 def plot_curves(folder: Path, path: Path) -> None:
-    """Plot the primary metric of nominal robots over steps into a file: a line per training, a thick one per mean."""
+    """Plot learning curves (primary metric of nominal robots) to a file: a line per training, thick ones for means."""
     with figure(path, 1, len(CURVES), figsize=(11, 4), title="Learning curves of the paper's tasks") as axes:
         for axis, (task, label, paper) in zip(axes, CURVES, strict=True):
             for i, arm in enumerate(ARMS):

@@ -51,7 +51,7 @@ ERRORS = {
 
 
 def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the table of NEEDS: policy, commands of test and training, success and error, and when not."""
+    """Return a Markdown table of the policy for each of a user's NEEDS: its commands, success, error and exclusions."""
     lines = []
     for words, policy, unless, tests in NEEDS:
         rows, task = first_seed(policy), tasks[policy]

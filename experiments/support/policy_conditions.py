@@ -24,7 +24,7 @@ class TestCondition(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Description, with the solver if that is SolverMuJoCo."""
+        """Name of the condition in tables, with the solver if that is SolverMuJoCo."""
         return self.words + (", SolverMuJoCo" if self.values.get("solver") == "mujoco" else "")
 
 

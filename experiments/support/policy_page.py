@@ -19,13 +19,13 @@ BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. ]+) -->\n).*?(<!-- end of table 
 
 
 def pages() -> list[Path]:
-    """Return the pages that may have generated tables."""
+    """Return the paths of the documentation pages and policies' READMEs that may have generated tables."""
     return [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "reference/metrics.md",
             *sorted(POLICIES.glob("*/README.md"))]  # fmt: skip
 
 
 def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the generated text with a name: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice`, `seeds`.
+    """Return the text of a page by its name: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice`, `seeds`.
 
     Raises InputError: there is no such text.
     """

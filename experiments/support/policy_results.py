@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
 
 def metrics_file(policy: str) -> Path:
-    """Return the path of the saved metrics of a policy, or of COMBINED."""
+    """Return the path of the saved metrics of a policy, or of the tests with three policies (COMBINED)."""
     return RESULTS / "combined.json" if policy == COMBINED else POLICIES / policy / METRICS
 
 
@@ -63,7 +63,7 @@ def read_rows(folder: Path, policies: Sequence[str]) -> list[Row]:
 
 
 def saved_rows(policy: str) -> list[Row]:
-    """Read the rows in the saved metrics of a policy, or of COMBINED; none if there is no file."""
+    """Read the saved rows of metrics of a policy, or of the tests with three policies (COMBINED); [] without a file."""
     path = metrics_file(policy)
     saved = json.loads(path.read_text())["rows"] if path.is_file() else []
     return ordered(make_row(policy, row["condition"], row["seed"], row) for row in saved)

@@ -30,7 +30,7 @@ class TableColumn(NamedTuple):
 
 
 def columns(*pairs: tuple[str, str]) -> tuple[TableColumn, ...]:
-    """Return columns of one metric each, from pairs of title and key."""
+    """Return table columns of one metric each, from pairs (title, key of the metric)."""
     return tuple(TableColumn(title, (key,)) for title, key in pairs)
 
 
@@ -100,7 +100,7 @@ KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_ME
 
 
 def published(task: TaskCfg) -> list[tuple[str, dict[str, MetricValue]]]:
-    """Return the published results of a task: words and metrics of each."""
+    """Return the published results of a task, each as a description and its metrics by key."""
     suite = task.evaluation_suite
     known = [(SIMULATION[suite], EVALUATIONS[suite].paper)] if suite in SIMULATION else []
     return [(words, {key: MetricValue(value) for key, value in values.items()})
@@ -199,7 +199,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
 
 
 class TestTable(NamedTuple):
-    """Table of tests: a line for each policy and test."""
+    """Definition of a Markdown table of tests, with a line for each policy and test."""
 
     tests: tuple[str, ...]  # Keys of TESTS or CONDITIONS
     columns: tuple[TableColumn, ...]
@@ -257,7 +257,7 @@ TEST_TABLES = {
 
 
 def test_table(name: str) -> str:
-    """Return a table of TEST_TABLES; tests that were not measured are left out."""
+    """Return the Markdown table `name` of TEST_TABLES, a line per policy and test; unmeasured tests are left out."""
     tests, wide, policies = TEST_TABLES[name]
     policies = policies or TESTS[tests[0]].policies
     lines = []

@@ -143,7 +143,7 @@ class SoakCounters:
         self._counts += torch.stack([flagged.sum(), (self._residual > self._tolerance).sum(), (~finite).sum()])
 
     def read(self) -> SoakTotals:
-        """Return the totals; waits for the device."""
+        """Return the counts and largest speeds so far; waits for the device."""
         return SoakTotals(*self._counts.tolist(), *self._speeds.tolist())
 
 

@@ -100,7 +100,7 @@ def options(flags: Iterable[Flag]) -> list[str]:
 
 
 def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
-    """Return the values of each flag that takes one of several words."""
+    """Return the allowed values of each flag that takes one of several words, by the flag `--name`."""
     return {
         f"--{flag.name}": [str(value) for value in get_args(flag.kind) if value]
         for flag in flags
@@ -109,5 +109,5 @@ def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
 
 
 def cases(words: dict[str, Iterable[str]] | dict[str, list[str]]) -> str:
-    """Return the branches of the script's `case` statement: for each name, the words that complete it."""
+    """Return the branches of the shell script's `case` statement: for each name, the words that may follow it."""
     return "\n".join(f'            {name}) words="{" ".join(each)}" ;;' for name, each in words.items())

@@ -56,7 +56,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType]) -> None:
-    """Run the suite named after --suite in args (policy of the task, then flags). Raises UsageError: no such suite."""
+    """Run the test suite whose name follows --suite in args (policy, then flags). Raises UsageError: no such suite."""
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)

@@ -38,7 +38,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def export(cfg: ExportCfg) -> Path:
-    """Write the policy's folder or ONNX file, print its path and return it; name a run's checkpoint on standard error.
+    """Write the policy's folder or ONNX file, print its path and return it; print a run's checkpoint on standard error.
 
     Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's suffix, or
     exists and `overwrite` is not set. CheckpointError: the checkpoint cannot be used.

@@ -162,7 +162,7 @@ def sysid(cfg: SysidCfg) -> None:
 
 
 def print_result(result: Identification) -> None:
-    """Print parameters with 95 % intervals, χ², starts, undetermined combinations and warnings."""
+    """Print an identification: parameters with 95 % intervals, χ², starts, undetermined combinations and warnings."""
     from rich.console import Console
     from rich.table import Table
 

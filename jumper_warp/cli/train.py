@@ -112,7 +112,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
-    """Return and print the flags of a task's --preset in unparsed arguments.
+    """Return and print the flags that a task's preset, chosen by --preset in unparsed arguments, stands for.
 
     Flags that the arguments override, or that the --trainer does not use, are left out.
     Raises UsageError: the task has no such preset.

@@ -1,4 +1,4 @@
-"""Estimate of a training's memory, and its check before anything is built."""
+"""Estimate of the memory that a training needs, compared with the free memory before anything is built."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class MemoryPool(NamedTuple):
 
 
 def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
-    """Return the device memory of PPO's networks and rollouts [byte].
+    """Return the device memory that PPO's networks and rollouts need [byte], fixed and for each world.
 
     num_obs, num_critic_obs: sizes of the observations of actor and critic.
     The peak is in the critic's pass over the whole rollout: the buffers, the samples as rows with their orders, the

@@ -244,7 +244,7 @@ class ClosedLoop:
         return LoopState(*parts), simulated
 
     def observation(self, state: LoopState) -> torch.Tensor:
-        """Return the environment's observation with noise, and with derivatives w.r.t. `state`.
+        """Return the environment's noisy observation, with derivatives with respect to `state`.
 
         Shape (num_worlds, columns).
         """

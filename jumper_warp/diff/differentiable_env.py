@@ -21,7 +21,7 @@ class DifferentiableEnv:
     """
 
     def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
-        """Wrap a `jumper_warp.envs.env.Env`.
+        """Wrap an environment (`jumper_warp.envs.env.Env`) whose rewards become differentiable.
 
         world_norm: norm to which the gradient w.r.t. each part of `LoopState` is clipped, by world and policy step.
         Raises InputError: as `ClosedLoop`, or no reward has a derivative.

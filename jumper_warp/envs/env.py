@@ -185,7 +185,7 @@ class Env(Stages):
 
     @locked
     def use_reset_mask(self) -> torch.Tensor:
-        """Let `step` reset worlds by a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.
+        """Make `step` reset worlds of a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.
 
         Where the mask is not 0, a step ignores the action and begins a new episode; it counts in no metric, and
         `reward`, `done` and the like keep their values. Call this before the first reset.

@@ -49,7 +49,7 @@ class RslRlVecEnv(RslRlEnv):
 
     @property
     def step_dt(self) -> float:
-        """Time of a policy step [s]."""
+        """Duration of a policy step [s]."""
         return self.cfg["policy_dt_s"]
 
     def write_config(self, folder: str | Path, activation: str = "elu") -> None:

@@ -114,7 +114,7 @@ class Stages:
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return the kernels that a reset and `step` launch, each with its block size; draws: as in `usual_kernels`."""
+        """Return the kernels of `step` and of `reset` (draws) or `evaluation_reset`, each with its block size."""
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]

@@ -160,7 +160,7 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
 
 @dataclass(frozen=True)
 class AttitudeFlags:
-    """Flags of turns about the body's axes, in both directions, from rest in the default pose."""
+    """Flags of `jumper evaluate` for turns about the body's axes, in both directions, from rest in the default pose."""
 
     num_turns: int = 60  # Number of turns
     angle: float = 90.0  # [deg] Angle of every turn
@@ -185,7 +185,7 @@ class AttitudeFlags:
 
 @dataclass(frozen=True)
 class AttitudePlayFlags:
-    """Flags of recorded turns about the body's axes, in both directions."""
+    """Flags of `jumper play` for turns about the body's axes, in both directions."""
 
     angle: float = 90.0  # [deg] Angle of every turn
 

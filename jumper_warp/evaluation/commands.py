@@ -104,7 +104,7 @@ class FilmCfg:
             check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
     def write(self, recording: Recording) -> Path:
-        """Write the film; return its path."""
+        """Write a film of a recording to the file `video`; return its path."""
         from jumper_warp.viz.film import write_film
 
         assert self.video is not None

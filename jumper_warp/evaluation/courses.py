@@ -259,7 +259,7 @@ class CourseLog(EvaluationLog):
 
     @property
     def landing_error(self) -> np.ndarray:
-        """Distance from base to goal when walking takes over [m], (robots, commands); NaN unless a jump to a place."""
+        """Distance from base to goal at the switch to walking [m], (robots, commands); NaN unless a jump to a place."""
         return np.where(self.target_skill == JUMP_TO, np.linalg.norm(self.offset, axis=-1), np.nan)
 
     @property
@@ -287,7 +287,7 @@ class CourseLog(EvaluationLog):
         return {"skill/{}": np.array(NAMES)[self.skills[-1]]}
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw of all robots: goals of their jumps, NaN if none, and commanded velocities."""
+        """Return the markers of a recording: goals of all robots' jumps, NaN if none, and commanded velocities."""
         goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
         return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
@@ -342,7 +342,7 @@ def course_metrics(course: CourseLog) -> Metrics:
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return the paw force's ripple before, and step at, each handover to a jump [N], (handovers,) each.
+    """Return the ripple of paw forces before each handover to a jump, and their change at it [N], (handovers,) each.
 
     Ripple: peak-to-peak force over the last FORCE_WINDOW seconds before the handover; step: change of the force between
     the policy steps before and after it. Each is the maximum over the four paws.

@@ -125,7 +125,7 @@ def rows_are_equal(arrays: dict[str, np.ndarray]) -> bool:
 
 
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the real numbers of a task's state that differ between worlds, as columns start_<field>, also with _<i>.
+    """Return the floats of a task's state that differ between worlds, as columns start_<field>; vectors: with _<i>.
 
     Of a single world, those that are not 0. arrays: of `Env.task_arrays`.
     """
@@ -181,7 +181,7 @@ def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.nd
 
 @dataclass(frozen=True)
 class EpisodeFlags:
-    """Flags of episodes that start as in training, or with a command at rest in the default pose."""
+    """Flags of `jumper evaluate` for episodes that start as in training or, with a command, in the default pose."""
 
     num_episodes: int = 200  # Number of episodes
     command: tuple[float, ...] = ()
@@ -212,7 +212,7 @@ class EpisodeFlags:
 
 @dataclass(frozen=True)
 class EpisodePlayFlags:
-    """Flags of a recorded episode of one robot."""
+    """Flags of `jumper play` for an episode of one robot."""
 
     command: tuple[float, ...] = ()
     """Up to four values of the task's command; omitted ones are 0 (default: the task's reset samples each command)."""

@@ -1,4 +1,4 @@
-"""Table EVALUATIONS of the evaluations of tasks (flags, terminations, metrics), by `TaskCfg.evaluation_suite`."""
+"""Evaluation settings for each kind of task (flags, terminations): EVALUATIONS, by `TaskCfg.evaluation_suite`."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class EvaluationFlags(Protocol):
     """Interface of a dataclass with the flags of `jumper evaluate` for some tasks, such as jumps to heights."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return a new log with the commands of all worlds; seed: seed of sampled commands."""
+        """Return a new evaluation log, which commands all worlds and records outcomes; seed: of sampled commands."""
         ...
 
     def metrics(self, log: Any) -> Metrics:
-        """Return the metrics of a finished log that `self.log` returned."""
+        """Return the metrics of a finished evaluation log that `self.log` returned."""
         ...
 
 
@@ -46,7 +46,7 @@ class PlayFlags(Protocol):
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
-        """Return a new log with the commands of all worlds."""
+        """Return a new evaluation log, which commands all worlds and records their outcomes."""
         ...
 
 
@@ -89,7 +89,7 @@ EVALUATIONS: dict[str, Evaluation] = {
 
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
-    """Return how policies of a task are evaluated. Raises PolicyError: EVALUATIONS lacks `evaluation_suite`."""
+    """Return the evaluation settings of a task's policies. Raises PolicyError: EVALUATIONS lacks `evaluation_suite`."""
     if task.evaluation_suite not in EVALUATIONS:
         known = f"known are {[*EVALUATIONS]}"
         raise PolicyError(f"{task.name}: unknown evaluation_suite {task.evaluation_suite!r:.60}; {known}")

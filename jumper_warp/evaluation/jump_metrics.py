@@ -104,7 +104,7 @@ def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metric
 
 @dataclass(frozen=True)
 class JumpFlags:
-    """Flags of jumps from rest in the default pose."""
+    """Flags of `jumper evaluate` for jumps from rest in the default pose."""
 
     num_jumps: int = 200  # Number of jumps
     success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
@@ -126,7 +126,7 @@ class JumpFlags:
 
 @dataclass(frozen=True)
 class HeightFlags(JumpFlags):
-    """Flags of jumps to evenly spaced heights."""
+    """Flags of `jumper evaluate` for jumps to evenly spaced heights."""
 
     success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
     height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
@@ -143,7 +143,7 @@ class HeightFlags(JumpFlags):
 
 @dataclass(frozen=True)
 class HeightPlayFlags:
-    """Flags of recorded jumps to heights."""
+    """Flags of `jumper play` for jumps to heights."""
 
     height: tuple[float, ...] = (0.6, 0.9, 1.1)  # [m] Commanded base heights, one robot each
     length: tyro.conf.Suppress[float] = 3.5  # [s] Length of the recording, unless `jumper play --seconds` sets it
@@ -159,7 +159,7 @@ class HeightPlayFlags:
 
 @dataclass(frozen=True)
 class LandingFlags(JumpFlags):
-    """Flags of jumps to landing positions from rest in the default pose."""
+    """Flags of `jumper evaluate` for jumps to landing positions from rest in the default pose."""
 
     goal_x: tuple[float, float] = (0.3, 1.5)
     """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
@@ -185,7 +185,7 @@ class LandingFlags(JumpFlags):
 
 @dataclass(frozen=True)
 class LandingPlayFlags:
-    """Flags of recorded jumps to landing positions."""
+    """Flags of `jumper play` for jumps to landing positions."""
 
     goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Goal of a robot, ahead and to the left; repeat the flag for each robot (default: three goals)."""

@@ -27,7 +27,7 @@ MAX_BYTES = 2**20
 
 @dataclass(frozen=True)
 class ScriptStep:
-    """One command of a script."""
+    """One command of a script: to walk or stand for some time, or to jump."""
 
     kind: str  # One of `KINDS`
     values: tuple[float, ...] = (0.0, 0.0, 0.0)

@@ -313,7 +313,7 @@ class Farthest(Suite):
 
 
 def plot(run: EvaluationRun, file: str, title: str, logs: dict[str, JumpLog], words: str, **options: Any) -> None:
-    """Plot goals and landings of each robot's first jump; logs: by scene; words: numbers; options: `plot_landings`."""
+    """Plot goals and landings of each robot's first jump; logs: by scene; words: caption; options: `plot_landings`."""
     points = {name: (log.goals[:, 0, :2], log.landing[:, 0], log.success[:, 0]) for name, log in logs.items()}
     conditions = f"{run.title}, {words}"
     plot_landings(
@@ -327,7 +327,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
 
 
 def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
-    """Return reliable jump distances, the metrics of all jumps, and those of each bin as lists `bin_<key>`.
+    """Return the largest distances with reliable jumps, metrics of all jumps, and lists `bin_<key>` over distance bins.
 
     bins: logs by distance at the bin's middle [m], ascending.
     """

@@ -89,7 +89,7 @@ class Suite(EvaluationArgs, ABC):
 
 
 class Sweep(Suite):
-    """Base class of the sweeps, over goals that flags of `jumper evaluate` define."""
+    """Base class of suites with one jump to each of evenly spaced goals, which flags of `jumper evaluate` define."""
 
     pushed: ClassVar[tuple[str, ...]]  # Keys of the metrics that are also measured with pushes in flight
 

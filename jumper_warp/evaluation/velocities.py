@@ -121,13 +121,13 @@ class VelocityLog(EvaluationLog):
         return np.array([*self.task.termination_names, "walked"])[self.end]
 
     def velocity_history(self) -> np.ndarray:
-        """Return the velocities after every policy step, (steps, robots, 3); NaN after a fall."""
+        """Return the robots' velocities after every policy step, (steps, robots, 3); NaN after a fall."""
         velocity = np.array(self.velocity, dtype=float).reshape(-1, len(self.commands), 3)
         velocity[np.arange(len(velocity))[:, None] >= self.fall_step] = np.nan
         return velocity
 
     def command_history(self) -> np.ndarray:
-        """Return the command at every policy step, (steps, robots, 3); it applies from the step after its time."""
+        """Return the robots' commands at every policy step, (steps, robots, 3); each applies from the next step."""
         targets = self._target(np.arange(1, len(self.velocity) + 1))
         if np.isinf(self._slew).all():
             return targets
@@ -179,7 +179,7 @@ class VelocityLog(EvaluationLog):
         return self.commands
 
     def marks(self) -> dict[str, np.ndarray]:
-        """Return what recordings draw: the current commanded velocities of all robots."""
+        """Return the markers of a recording: the current commanded velocities of all robots."""
         return {"commands": self.command_history()[-1]}
 
 
@@ -240,7 +240,7 @@ def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class VelocityFlags:
-    """Flags of walks: commands from a grid of three velocities; each robot receives a new command at intervals.
+    """Flags of `jumper evaluate` for walks: each robot receives commands from a grid of velocities at intervals.
 
     Half of the robots receive steps of the command, half a command slewed at 1.25 m/s^2 and rad/s^2. Additional robots
     are commanded to stand.
@@ -276,7 +276,7 @@ class VelocityFlags:
 
 @dataclass(frozen=True)
 class VelocityPlayFlags:
-    """Flags of a recorded walk with a sequence of commands."""
+    """Flags of `jumper play` for a walk with a sequence of commands."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
     """[m/s], [m/s], [rad/s] Velocity ahead, to the left, about z; repeat the flag per command (default: six)."""

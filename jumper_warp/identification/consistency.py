@@ -1,4 +1,4 @@
-"""χ² tests of a fit: the residuals of each channel and motion, and the parameters that each sensor calls for."""
+"""χ² tests of a fit: of the residuals by channel and motion, and of each sensor's agreement with all others."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COMPARABLE = 10.0
 
 @dataclass(frozen=True)
 class FitTest:
-    """Result of a one-sided χ² test of a motion: of its residuals, or of the parameters that a sensor calls for."""
+    """Result of a one-sided χ² test of a motion: of its residuals, or of one sensor's agreement with all others."""
 
     motion: str
     channel: str  # empty: all channels of the motion; "parameters by ...": of a sensor, compared with all others
@@ -59,7 +59,7 @@ def variance_factor(columns: Sequence[np.ndarray]) -> float:
 
 
 class Sensor(NamedTuple):
-    """A motor's angle and rate in one motion, or a channel of the base, and the parameters that it calls for."""
+    """A motor's measured angle and rate, or a channel of the base, in one motion, with Fisher information and score."""
 
     motion: MotionResiduals
     name: str  # such as "BL_outer" or "position"
@@ -80,7 +80,7 @@ def sensor_columns(motion: MotionResiduals) -> dict[str, list[int]]:
 
 
 def sensors(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
-    """Return the sensors of all motions, each with the parameters that its data call for; normal: normal equations."""
+    """Return the sensors of all motions, with Fisher information and score of their data; normal: normal equations."""
     result = []
     for i, motion in enumerate(problem.motions):
         column_of = np.nonzero(motion.valid)[1]
@@ -99,7 +99,7 @@ def test_level(problem: LeastSquares) -> float:
 def parameter_tests(
     problem: LeastSquares, normal: NormalEquations, mismatch: float = 1.0
 ) -> list[tuple[Sensor, FitTest]]:
-    """Test for each sensor whether its data agree with the parameters that all others call for (Rao's score test).
+    """Test for each sensor whether its data imply the same parameters as all other data (Rao's score test).
 
     At the fit the scores of all sensors and the prior cancel. The score of a sensor with information I has the
     covariance I - I C I, where C is the covariance of the parameters. Combinations of parameters below `COMPARABLE` are

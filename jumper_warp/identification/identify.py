@@ -262,7 +262,7 @@ def descend(
 
 
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
-    """Return a random change (P,) of the parameters that moves a start away from a minimum with equations `normal`."""
+    """Return a random change (P,) of the parameters, to start a search away from a minimum with equations `normal`."""
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
     move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
     return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)

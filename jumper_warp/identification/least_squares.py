@@ -177,7 +177,7 @@ class LeastSquares:
         return self.assemble(point, linearised)
 
     def without_jumps(self, point: Point, normal: NormalEquations) -> NormalEquations:
-        """Return the normal equations at a point with derivatives that exclude jumps of the residuals.
+        """Return normal equations at a point with derivatives that ignore discontinuities of the residuals (impacts).
 
         Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
         forward and the backward difference, so the smaller one is taken. normal: from forward differences.
@@ -224,7 +224,7 @@ class LeastSquares:
         return normal
 
     def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
-        """Return the best point for several values of one parameter, when all other unknowns follow to first order.
+        """Try several values of one parameter, with all other unknowns refitted to first order; return the best point.
 
         With its cost. index: of the parameter; moves: changes of its z, (K,).
         """

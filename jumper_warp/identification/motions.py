@@ -130,7 +130,7 @@ class RecordedMotion:
 
     @property
     def duration(self) -> float:
-        """Time from the first row to the last [s]."""
+        """Duration of the recorded motion, from the first row to the last [s]."""
         return float(self.time[-1] - self.time[0])
 
     def columns(self) -> dict[str, Any]:

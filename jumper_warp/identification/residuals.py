@@ -58,7 +58,7 @@ class MotionResiduals:
         dt: float | None = None,
         span: tuple[int, int] | None = None,
     ):
-        """Prepare the residuals of a recorded motion.
+        """Prepare to compare rows of a recorded motion with its simulation.
 
         dt [s]: largest physics step, default 1/480; span: first row, end row. Raises InputError: angles of the wrong
         sign, gaps, or dt out of range; NothingMeasured.

@@ -28,7 +28,7 @@ LARGEST_PRIOR_ERROR = 3.0
 
 @dataclass(frozen=True)
 class DescentStep:
-    """Log entry of one step of the optimisation."""
+    """Log entry of one optimisation step: cost, damping and effort so far."""
 
     stage: int  # number of the stage, from 1; 0: CMA-ES
     chi2: float  # [1] Cost over the number of measured values
@@ -115,7 +115,7 @@ class Identification:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations of the normalised parameters: noise, model and starts, at most the prior's 1, (P,)."""
+        """Standard deviations (P,) of normalised parameters from noise, model errors and starts, at most 1 (prior)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
         return np.minimum(np.sqrt(noise**2 + self.systematic**2 + self.spread**2), 1.0)
 

@@ -1,4 +1,4 @@
-"""Policies by name or folder: where they lie, and a summary of their metrics; read without PyTorch."""
+"""Look-up of policies by name or folder, and summaries of their metrics, without PyTorch."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class Conditions:
         return ranges.with_fixed(**self.fixed_parameters)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a copy of a task with the gravity, randomisation and events of these conditions, without margins.
+        """Return a copy of a task with gravity, randomisation and events of these conditions, and no collision margins.
 
         With fixed parameters and no randomisation it is on level ground, without the task's events.
         """

@@ -44,7 +44,7 @@ def is_run(source: str | Path) -> bool:
 
 
 def run_folder(source: Path) -> Path:
-    """Return the folder of a run, or of a checkpoint's run."""
+    """Return the folder of the training run that a checkpoint (.pt) belongs to; any other path unchanged."""
     if source.suffix != ".pt":
         return source
     return source.parent if RSL_RL.fullmatch(source.name) else source.parents[1]

@@ -66,7 +66,7 @@ class TrainingLog:
         self, folder: Path, config: dict[str, Any], total: int, steps: int, tensorboard: bool = True,
         wandb: bool = False, iteration: int = 0, expected_rate: float = 0.0,
     ) -> None:  # fmt: skip
-        """Open the outputs; folder: the run's existing folder.
+        """Open the metrics file and the other outputs of the log; folder: the run's existing folder.
 
         config: JSON-ready configuration of the run. total: largest number of iterations. steps: environment steps per
         iteration, of all worlds. tensorboard: whether to write events. wandb: whether to upload to Weights & Biases.

@@ -1,4 +1,4 @@
-"""Checks that values of a robot description are plausible, which reveal wrong units; the robot may carry a person."""
+"""Plausibility checks of a robot description, which reveal wrong units; robots may be large enough for a person."""
 
 from __future__ import annotations
 

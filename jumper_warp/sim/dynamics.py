@@ -51,7 +51,7 @@ class KernelModules:
         self._package = float64_kernels().__name__ if double else "jumper_warp.kernels"
 
     def __getattr__(self, name: str) -> Any:
-        """Import a kernel module and keep it. Raises AttributeError: there is no such module."""
+        """Import a kernel module by name, and cache it. Raises AttributeError: there is no such module."""
         for path in KERNEL_MODULES:
             if path.split(".")[-1] == name:
                 module = importlib.import_module(f"{self._package}.{path}")

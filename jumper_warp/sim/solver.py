@@ -79,7 +79,7 @@ def warn_of_colliders(model: Model) -> None:
 
 
 class SolverJumper(SolverBase):
-    """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
+    """Solver of the Jumper's exact 18-coordinate dynamics with rigid paw contact.
 
     The five-bar loops hold by construction. Integration is semi-implicit Euler. Contact is solved
     paw by paw to `tolerance`: in turn on a CPU (Gauss-Seidel), all at once on a GPU, or in turn where that does not

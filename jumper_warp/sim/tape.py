@@ -18,7 +18,7 @@ class DifferentiableStep:
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
-        """Prepare differentiable time steps of the robot's dynamics.
+        """Store the dynamics and the settings of the contact solver for later steps.
 
         max_sweeps, tolerance [m/s]: of the contact iteration, whose error gradients have.
         """

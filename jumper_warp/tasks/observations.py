@@ -39,12 +39,12 @@ REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
 
 
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
-    """Return observation terms with a history of `steps` policy steps for those named in `REMEMBERED`."""
+    """Return observation terms, in which those of motion, angles and action have a history of `steps` policy steps."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
 
 
 def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
-    """Return a task whose actor terms in `REMEMBERED` have a history of `steps` policy steps; None: unchanged."""
+    """Return a task whose actor observes motion, angles and action over `steps` policy steps; None: unchanged."""
     if steps is None:
         return task
     return replace(task, observations=replace(task.observations, actor=remembered(task.observations.actor, steps)))

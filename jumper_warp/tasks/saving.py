@@ -106,7 +106,7 @@ class Finder:
     """Look-up of functions and types that a saved task names `module:name`, in the project's modules and the user's."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
-        """Look names up in the project's modules, in `modules`, the user's loaded ones, and in their neighbours."""
+        """Set the modules to search: the project's, `modules` (the user's loaded ones), and their neighbours."""
         self.modules = {module.__name__: module for module in with_neighbours(list(modules))}
 
     def __call__(self, name: Any, where: str) -> Any:

@@ -37,7 +37,7 @@ class Actor(Protocol):
 
     @property
     def layers(self) -> Sequence[tuple[torch.Tensor, torch.Tensor]]:
-        """Weight (out, in) and bias (out,) of each layer."""
+        """Weight (out, in) and bias (out,) of each layer of the policy's network."""
         ...
 
 

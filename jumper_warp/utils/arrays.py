@@ -1,4 +1,4 @@
-"""Bounded reading of NumPy archives."""
+"""Reading of NumPy archives (.npz) of limited size."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def read_json(
 
 
 def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, finite: bool = True) -> Any:
-    """Return the content of JSON data (UTF-8).
+    """Parse JSON data (UTF-8) with limits on depth and numbers, and return its content.
 
     where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
     not JSON, nests deeper than MAX_DEPTH, repeats a key, or has such a number or an integer of more than MAX_DIGITS

@@ -22,7 +22,7 @@ else:
 
 
 def records(structs: wp.array) -> NDArray[np.void]:
-    """Copy a Warp array of structs to a NumPy array with a field for each of theirs; waits for the device."""
+    """Copy a Warp array of structs to a structured NumPy array with the same fields; waits for the device."""
     return cast("NDArray[np.void]", structs.numpy())
 
 

@@ -59,7 +59,7 @@ class Metric(NamedTuple):
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit in the name of a metric, such as m/s for `..._m_s` or `... [m/s]`; None: no unit, as a count."""
+    """Return the unit in the name of a metric, such as m/s for `speed_m_s` or `speed [m/s]`; None: none, as a count."""
     return split_unit(key)[1]
 
 
@@ -73,7 +73,7 @@ def split_unit(key: str) -> tuple[str, str | None]:
 def measure(
     table: Iterable[Metric], outcome: Outcome, where: np.ndarray | None = None, prefix: str = "", note: str = ""
 ) -> Metrics:
-    """Compute the metrics that a table defines from the results of an evaluation.
+    """Compute metrics, given by their definitions, from the results of an evaluation.
 
     Returned by key, each with `prefix` before it. where: mask of the trials to use, default: all; note: description of
     these trials, for the file.

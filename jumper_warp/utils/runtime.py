@@ -31,7 +31,7 @@ class Commit(NamedTuple):
 
 
 class DeviceInfo(NamedTuple):
-    """Properties of a Warp device."""
+    """Names, CUDA version and graph capabilities of a Warp device."""
 
     alias: str  # warp's name of the device, for example `cpu` or `cuda:0`
     name: str  # product name of the processor
@@ -113,7 +113,7 @@ def init_warp() -> None:
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the git commit of the source tree in `folder`, by default this package's folder, cached then.
+    """Return the git commit of the source tree in `folder`, by default this package's, which is cached.
 
     None without git, outside a git tree, in a tree without commits, and if the enclosing tree does not track the
     folder, as for a package installed inside another project.

@@ -20,7 +20,7 @@ FIRST_COLLECTION_THRESHOLD = 1_200_000
 
 
 class DeferredModule(ModuleType):
-    """Module that is executed at the first access to a name that it lacks until then.
+    """Imported module whose code runs at the first access to a name that it lacks until then.
 
     Unlike with `importlib.util.LazyLoader`, `__file__` and other names of the import system do not execute it:
     `inspect` and PyTorch read those of all modules.
@@ -29,7 +29,7 @@ class DeferredModule(ModuleType):
     _lock, _running = RLock(), False
 
     def __getattr__(self, name: str) -> Any:
-        """Execute the module, and return the attribute. Raises AttributeError: the module has no such name."""
+        """Run the module's code, and return its attribute. Raises AttributeError: the module has no such name."""
         with DeferredModule._lock:
             if type(self) is DeferredModule and not self._running:
                 self._running = True
@@ -51,16 +51,16 @@ class DeferredLoader(Loader):
         self.loader = loader
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Return what the module's own loader returns, None for a usual module."""
+        """Return the module object that the module's own loader creates, None for a usual module."""
         return self.loader.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Make the module a `DeferredModule`, whose names of the import system are set already."""
+        """Make the module a `DeferredModule` instead of running its code; the import system has set its own names."""
         module.__class__ = DeferredModule
 
 
 class DeferredFinder(MetaPathFinder):
-    """Finder of the modules in `DEFERRED`."""
+    """Import finder that defers the code of the modules in `DEFERRED` to their first use."""
 
     def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Return the specification of a deferred module, None for any other module."""

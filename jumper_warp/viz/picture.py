@@ -1,4 +1,4 @@
-"""Composite pictures: one scene with the robot at several times of a recording, and marks of heights and goals."""
+"""Composite pictures: one scene with the robot at several times of a recording, and markers of heights and goals."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Composition:
 
     @property
     def stays(self) -> bool:
-        """Whether the robot stays in place: the picture's horizontal axis is time, in the order of the moments."""
+        """Whether the robot stays in place, so that the picture's horizontal axis is time, in order of the moments."""
         return bool(self.shift.any())
 
     @property

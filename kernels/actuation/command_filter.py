@@ -38,7 +38,7 @@ class Limits:
 
 @wp.struct
 class FilterParams:
-    """Constants of the motor command filter, the same for all legs and worlds."""
+    """Limits, horizon and speed floor of the motor command filter, the same for all legs and worlds."""
 
     lateral: Limits
     transversal: Limits  # outer and inner alike

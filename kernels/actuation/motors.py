@@ -8,7 +8,7 @@ from ..scalar import real
 
 @wp.struct
 class MotorParams:
-    """Constants of one motor, at the joint (behind the gear)."""
+    """Gains, torque limits, speeds and sensor offset of one motor, at the joint (behind the gear)."""
 
     kp: real  # [N m/rad]
     kd: real  # [N m s/rad]
@@ -23,7 +23,7 @@ class MotorParams:
 
 @wp.struct
 class MotorArrays:
-    """Constants of all motors; motors of the legs FL, FR, BL, BR."""
+    """Gains, limits and sensor offsets of the motors of all worlds; motors by leg FL, FR, BL, BR."""
 
     kp: wp.array2d(dtype=real)  # [N m/rad] (12, num_worlds)
     kd: wp.array2d(dtype=real)  # [N m s/rad] (12, num_worlds)
@@ -38,7 +38,7 @@ class MotorArrays:
 
 @wp.func
 def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
-    """Return the constants of motor 0 to 11 of a world."""
+    """Return gains, limits and sensor offset of motor 0 to 11 of a world."""
     params = MotorParams()
     params.kp = motors.kp[motor, world]
     params.kd = motors.kd[motor, world]

@@ -14,7 +14,7 @@ from ..scalar import real, vec3
 
 @wp.struct
 class LegSpring:
-    """Constants of the spring between the knees of one leg."""
+    """Stiffness and rest length of the spring between the knees of one leg."""
 
     stiffness: real  # [N/m]; 0: no spring, and no gradient with respect to the stiffness
     length: real  # [m] at rest

@@ -95,7 +95,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] of a leg are beyond a hard stop or NaN; steps that end within press no stop."""
+    """Return whether motor angles [rad] of a leg are beyond a hard stop or NaN; if not, no stop is pressed."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):
@@ -162,7 +162,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of the hard stop in row i at rate [rad/s] at the step's start; 0 if it is not pressed."""
+    """Return the torque [N m] of the hard stop of row i (a motor or their sum) at a rate [rad/s]; 0 if not pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)

@@ -56,7 +56,7 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 
 @wp.func
 def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Return the state with the goal that a rotation `values` from the present orientation leads to; zeros: no turn.
+    """Return the task state whose goal is the present orientation, rotated by `values`; zeros: no turn.
 
     values: quaternion xyzw of any length, body axes. scene and heading are unused (signature of `command.set`).
     """

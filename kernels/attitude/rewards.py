@@ -9,13 +9,13 @@ from .state import POLICY_RATE, AttitudeState
 
 @wp.func
 def approach(robot: RobotView, state: AttitudeState) -> float:
-    """Reward for turning toward the goal orientation. It is the decrease of the angle to it per second [rad/s]."""
+    """Reward for turning toward the goal orientation: decrease of the angle to it per second [rad/s]."""
     return (state.old_error - state.error) * POLICY_RATE
 
 
 @wp.func
 def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
-    """Reward for an orientation close to the goal, 1 at the goal. It is phi of the angle to it; std [rad]: width."""
+    """Reward for an orientation close to the goal: Gaussian phi of the angle to it, 1 at the goal; std [rad]: width."""
     return phi(state.error, std)
 
 
@@ -33,5 +33,5 @@ def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_post
 
 @wp.func
 def spin(robot: RobotView, state: AttitudeState) -> float:
-    """Penalty of rotation of the base. It is its squared angular speed [rad^2/s^2]."""
+    """Penalty of rotation of the base: its squared angular speed [rad^2/s^2]."""
     return wp.length_sq(robot.ang_vel)

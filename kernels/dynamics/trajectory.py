@@ -146,7 +146,7 @@ def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
 
 @wp.func
 def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParams:
-    """Return the constants of motor 0 to 11 of a world, its own over-speed fade included."""
+    """Return gains, limits, sensor offset and over-speed fade of motor 0 to 11 of a world."""
     params = load_motor(actuation.motors, motor, world)
     params.fade_start = actuation.fade[0, world]
     params.fade_end = actuation.fade[1, world]

@@ -1,4 +1,4 @@
-"""Forms of the paper's Table IV (jumping rewards) and of its terminations that the stock terms do not have.
+"""Reward (paper, Table IV) and termination terms of jumps in the paper's form, where the project's own terms differ.
 
 phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_*, scale_*: their widths, in the unit of their argument.
 The deceleration along the base's present velocity is the paper's; the stock terms use its velocity before the step.
@@ -15,7 +15,7 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset
 
 @wp.func
 def height_reward(error: float, std: float, scale: float) -> float:
-    """Return the reward for a height error [m] of a jump: phi_std + 3 psi_scale."""
+    """Return the reward for a height error [m] of a jump: Gaussian phi_std plus 3 times Laplacian psi_scale."""
     return phi(error, std) + 3.0 * psi(error, scale)
 
 
@@ -44,7 +44,7 @@ def estimated_jump_height(robot: RobotView, state: JumpState, std: float, scale:
 
 @wp.func
 def tracking(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a base close to the goal, in every phase. It is phi_std of the horizontal distance [m]."""
+    """Reward for a base close to the goal, in every phase: Gaussian phi_std of the horizontal distance [m]."""
     return phi(wp.length(goal_offset(robot, state)), std)
 
 
@@ -62,7 +62,7 @@ def estimated_tracking(robot: RobotView, state: JumpState, std: float, std_wide:
 
 @wp.func
 def orientation_error(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a level base in the jump's heading: phi_std of the squared rotation error [rad^2]."""
+    """Reward for a level base in the jump's heading: Gaussian phi_std of the squared rotation error [rad^2]."""
     error = angle_from_level(robot.quat, state.heading)
     return phi(error * error, std)
 

@@ -77,7 +77,7 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Reward for little horizontal base speed, doubled after takeoff. It is exp(-|v_xy| / speed_scale [m/s])."""
+    """Reward for little horizontal base speed: exp(-|v_xy| / speed_scale [m/s]), doubled after takeoff."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
     return (
         wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
@@ -86,7 +86,7 @@ def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, 
 
 @wp.func
 def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for a level base. It is phi_std of the sine of the tilt [1] (horizontal part of projected gravity)."""
+    """Reward for a level base: Gaussian phi_std of the sine of the tilt [1] (horizontal part of projected gravity)."""
     return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * waiting_weight(
         state, waiting_scale
     )
@@ -94,7 +94,7 @@ def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: f
 
 @wp.func
 def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for a base that does not rotate. It is phi_std of its angular speed [rad/s]."""
+    """Reward for a base that does not rotate: Gaussian phi_std of its angular speed [rad/s]."""
     return phi(wp.length(robot.ang_vel), std) * waiting_weight(state, waiting_scale)
 
 
@@ -102,7 +102,7 @@ def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_sca
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Reward for equal transversal angles, and small lateral ones. phi(variance [rad^2]) phi(norm of lateral [rad])."""
+    """Reward for equal transversal and small lateral angles: phi(variance [rad^2]) phi(norm of lateral ones [rad])."""
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
@@ -130,7 +130,7 @@ def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float,
 
 @wp.func
 def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for motor angles near the default pose in flight. It is phi_std of the rms motor offset [rad]."""
+    """Reward for motor angles near the default pose in flight: Gaussian phi_std of the rms motor offset [rad]."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(posture_offset(robot, 0.0), std)
@@ -181,7 +181,7 @@ def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a base that does not rotate in flight. It is phi_std of its angular speed [rad/s]."""
+    """Reward for a base that does not rotate in flight: Gaussian phi_std of its angular speed [rad/s]."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(wp.length(robot.ang_vel), std)
@@ -189,7 +189,7 @@ def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> f
 
 @wp.func
 def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for equal transversal motor angles left and right. It is phi_std of the rms difference [rad]."""
+    """Reward for equal transversal motor angles left and right: Gaussian phi_std of the rms difference [rad]."""
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0 and (m / 3) % 2 == 0:  # transversal motors of left legs; the right leg is 3 motors later
@@ -211,7 +211,7 @@ def standing_posture(robot: RobotView, state: JumpState, std: float, shift: floa
 
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Reward for a soft impact, for 0.3 s from touchdown. It is max(0, 1 - base deceleration / limit [m/s^2])."""
+    """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - base deceleration / limit [m/s^2])."""
     if not just_landed(state):
         return 0.0
     return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
@@ -219,7 +219,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Penalty of decelerating the base in stance, -1 to 0. It is minus deceleration / limit [m/s^2], clamped."""
+    """Penalty of decelerating the base in stance: minus deceleration / limit [m/s^2], clamped to -1..0."""
     if state.phase != STANCE:
         return 0.0
     return wp.clamp(base_deceleration(robot) / limit, -1.0, 0.0)
@@ -227,7 +227,7 @@ def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def catch_landing(robot: RobotView, state: JumpState) -> float:
-    """Reward for a base that still moves down, for 0.3 s from touchdown. It is the downward speed [m/s], 0 to 1."""
+    """Reward for a base that still moves down, for 0.3 s from touchdown: downward speed [m/s], clamped to 0..1."""
     if not just_landed(state):
         return 0.0
     return wp.clamp(-robot.lin_vel[2], 0.0, 1.0)
@@ -265,7 +265,7 @@ def tilt_over(robot: RobotView, angle: float) -> float:
 
 @wp.func
 def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Penalty of the base's tilt after touchdown. It is (sin(tilt) / sin(angle))^2; angle [rad]."""
+    """Penalty of the base's tilt after touchdown: (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != LANDED:
         return 0.0
     return tilt_over(robot, angle)
@@ -273,7 +273,7 @@ def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Penalty of the base's tilt while it falls in flight. It is (sin(tilt) / sin(angle))^2; angle [rad]."""
+    """Penalty of the base's tilt while it falls in flight: (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != FLIGHT or robot.lin_vel[2] > 0.0:
         return 0.0
     return tilt_over(robot, angle)
@@ -295,7 +295,7 @@ def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
 
 @wp.func
 def paws_down(robot: RobotView, state: JumpState) -> float:
-    """Reward for paws on the ground after touchdown. It is their number, 0 to 4."""
+    """Reward for paws on the ground after touchdown: their number, 0 to 4."""
     if state.phase != LANDED:
         return 0.0
     return float(robot.contacts)
@@ -321,7 +321,7 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def resting_action_rate(robot: RobotView, state: JumpState) -> float:
-    """Penalty of changes of the action while the robot should rest. It is the sum of their squares in a step."""
+    """Penalty of changes of the action while the robot should rest: sum of their squares in a policy step [1]."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.action - robot.prev_action)
@@ -329,7 +329,7 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
-    """Penalty of changes of motor torque while the robot should rest. It is the sum of their squares [N^2 m^2]."""
+    """Penalty of changes of motor torque while the robot should rest: sum of their squares [N^2 m^2]."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.torque - robot.prev_torque)

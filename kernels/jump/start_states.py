@@ -272,7 +272,7 @@ def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBas
 
 @wp.func
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
-    """Return the base's sampled state for the start mode (a `sample_base` of `sample_valid_state`)."""
+    """Return the base's sampled pose and velocity for the start mode; `sample_valid_state` calls it."""
     base = JumpBase()
     if start.start_mode == STANDING:
         base = standing_base(start, rng)

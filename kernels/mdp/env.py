@@ -15,7 +15,7 @@ RING = wp.constant(8)
 
 @wp.struct
 class Scene:
-    """Leg geometry, ground and default pose, which all worlds share."""
+    """Scene that all worlds share: leg geometry, ground and default pose."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     ground: Ground
@@ -31,7 +31,7 @@ class NoSettings:
 
 @wp.struct
 class EpisodeArrays:
-    """Episode state of all worlds, arrays of shape (num_worlds,)."""
+    """Episode state of all worlds (step counts, active tasks, rewards, end flags, levels), arrays (num_worlds,)."""
 
     seed: int  # of all random streams, as is `purpose`
     purpose: int  # index in `jumper_warp.utils.streams.PURPOSES`

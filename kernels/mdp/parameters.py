@@ -103,7 +103,7 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Set the Coulomb friction of each motor to a value from lower to upper [N m], moved by `motor_friction_move`."""
+    """Set the Coulomb friction of each motor to a value from lower to upper [N m], plus `motor_friction_move`."""
     for m in range(rng.lane, 12, rng.lanes):
         value = moved_uniform(rng, m, lower, upper, robot.motor_friction_move[m])
         robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = value
@@ -119,7 +119,7 @@ def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
 
 @wp.func
 def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
-    """Write speeds of motor m in a world: the active skill's nominal (no-load, cutoff) speeds times `ratio`.
+    """Write no-load and cutoff speed of motor m in a world: the active skill's nominal ones times `ratio`.
 
     Unless both ratios are 1, the cutoff speed is at most 0.95 of the no-load speed.
     """
@@ -191,7 +191,7 @@ def friction(
     robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
-    """Sample the friction coefficients [1] of a robot's paws, moved by `friction_move`.
+    """Sample dynamic and static friction coefficients [1] of a robot's paws from their ranges plus `friction_move`.
 
     The static one is at least the dynamic one.
     """
@@ -217,7 +217,7 @@ def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: 
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
-    """Sample the latency of actions from lower to upper [s], moved by `latency_move`.
+    """Sample the latency of actions from lower to upper [s], plus `latency_move`.
 
     With `zero_probability` it is the nominal one, which is 0 for the described robot, unless lower is upper.
     """

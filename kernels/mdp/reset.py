@@ -172,7 +172,7 @@ def default_pose_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Write the default pose with yaw `headings` [rad], and the start position of the block, where mask != 0.
+    """Write the default pose with yaw `headings` [rad], and the block's start position, in worlds with mask != 0.
 
     The robot is above the ground by the `eval_height_offset` of the world's skill; one thread per world.
     """
@@ -190,7 +190,7 @@ def advance_rng_kernel(
     # in, out
     episode: EpisodeArrays,
 ):
-    """Increment the step count where mask != 0, so that all random streams are new ones; one thread per world."""
+    """Increment the step count of worlds with mask != 0, which renews their random streams; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
         episode.step_count[world] = episode.step_count[world] + 1
@@ -206,7 +206,7 @@ def clear_history_kernel(
     arrays: RobotArrays,
     delays: Delays,
 ):
-    """Clear actions, torques, contacts and delays where mask != 0; one thread per (motor, world).
+    """Clear actions, torques, contacts and delays of worlds with mask != 0; one thread per (motor, world).
 
     Targets become the present motor angles; paw and base kinematics are updated. first: world of the first thread.
     """

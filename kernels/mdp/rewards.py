@@ -39,13 +39,13 @@ def posture_offset(robot: RobotView, shift: float) -> float:
 
 @wp.func
 def level(robot: RobotView, state: Any, width: float) -> float:
-    """Reward for a level base. It is phi of the base's tilt [rad]; width [rad]: width of the kernel."""
+    """Reward for a level base: Gaussian kernel phi of the base's tilt [rad]; width [rad]: of the kernel."""
     return phi(tilt(robot), width)
 
 
 @wp.func
 def horizontal_speed_sq(robot: RobotView, state: Any) -> float:
-    """Penalty of horizontal motion. It is the squared horizontal speed of the base [m^2/s^2]."""
+    """Penalty of horizontal motion: squared horizontal speed of the base [m^2/s^2]."""
     return robot.lin_vel[0] * robot.lin_vel[0] + robot.lin_vel[1] * robot.lin_vel[1]
 
 
@@ -57,37 +57,37 @@ def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
 
 @wp.func
 def action_clip(robot: RobotView, state: Any) -> float:
-    """Penalty of actions that the command filter changes. It is the sum of squared changes of targets [rad^2]."""
+    """Penalty of actions that the command filter changes: sum of squared changes of motor targets [rad^2]."""
     return robot.clipped
 
 
 @wp.func
 def motor_torque_sq(robot: RobotView, state: Any) -> float:
-    """Penalty of motor torque. It is the sum over motors of squared torque [N^2 m^2]."""
+    """Penalty of motor torque: sum over motors of squared torque [N^2 m^2]."""
     return square_sum(robot.torque)
 
 
 @wp.func
 def joint_acceleration(robot: RobotView, state: Any) -> float:
-    """Penalty of motor acceleration. It is the sum over motors of squared acceleration [rad^2/s^4]."""
+    """Penalty of motor acceleration: sum over motors of squared acceleration [rad^2/s^4]."""
     return square_sum(robot.joint_acc)
 
 
 @wp.func
 def action_rate(robot: RobotView, state: Any) -> float:
-    """Penalty of changes of the action. It is the sum of their squares since the previous policy step [1]."""
+    """Penalty of changes of the action: sum of their squares since the previous policy step [1]."""
     return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
 def action_acceleration(robot: RobotView, state: Any) -> float:
-    """Penalty of jerky actions. It is the sum of squares of the action's second difference over policy steps [1]."""
+    """Penalty of jerky actions: sum of squares of the action's second difference over policy steps [1]."""
     return square_sum(robot.action - 2.0 * robot.prev_action + robot.prev_prev_action)
 
 
 @wp.func
 def torque_sign_changes(robot: RobotView, state: Any) -> float:
-    """Penalty of jerky motor torques. It is the number of motors whose torque changed its sign in a policy step."""
+    """Penalty of jerky motor torques: number of motors whose torque changed its sign in a policy step."""
     total = float(0.0)
     for m in range(12):
         total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Kernel functions with written-out loops, whose hash Warp computes without building the kernel."""
+"""Unrolling of loops in kernel functions, whose hash Warp then computes without building the kernel."""
 
 import ast
 import hashlib

@@ -15,7 +15,7 @@ MIN_COMMAND = wp.constant(0.05)  # [m/s], [rad/s] a command with all three compo
 
 @wp.struct
 class CommandRanges:
-    """Ranges from which commands are sampled; limits: largest speeds ahead, back, aside [m/s], turning [rad/s]."""
+    """Ranges of sampled velocity commands; limits: largest speeds ahead, back, aside [m/s], turning [rad/s]."""
 
     first_range: wp.vec4  # limits at level 0
     last_range: wp.vec4  # limits at level `levels`

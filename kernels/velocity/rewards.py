@@ -19,33 +19,33 @@ def moving(state: VelocityState) -> float:
 
 @wp.func
 def linear_velocity(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Reward for tracking the commanded horizontal velocity. It is phi_std of the error [m/s], body axes."""
+    """Reward for tracking the commanded horizontal velocity: Gaussian phi_std of the error [m/s], body axes."""
     error = velocity_error(robot, state)
     return phi(wp.length(wp.vec2(error[0], error[1])), std)
 
 
 @wp.func
 def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Reward for tracking the commanded yaw rate. It is phi_std of the error [rad/s]."""
+    """Reward for tracking the commanded yaw rate: Gaussian phi_std of the error [rad/s]."""
     return phi(velocity_error(robot, state)[2], std)
 
 
 @wp.func
 def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of vertical motion of the base. It is its squared velocity along body z [m^2/s^2]."""
+    """Penalty of vertical motion of the base: its squared velocity along body z [m^2/s^2]."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]
     return up * up
 
 
 @wp.func
 def ang_vel_xy_l2(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of rolling and pitching. It is the sum of squared angular velocities about body x and y [rad^2/s^2]."""
+    """Penalty of rolling and pitching: sum of squared angular velocities about body x and y [rad^2/s^2]."""
     return robot.ang_vel[0] * robot.ang_vel[0] + robot.ang_vel[1] * robot.ang_vel[1]
 
 
 @wp.func
 def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of the base's tilt. It is the squared sine of the tilt (horizontal part of projected gravity) [1]."""
+    """Penalty of the base's tilt: squared sine of the tilt (horizontal part of projected gravity) [1]."""
     return (
         robot.projected_gravity[0] * robot.projected_gravity[0]
         + robot.projected_gravity[1] * robot.projected_gravity[1]
@@ -108,7 +108,7 @@ def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
 
 @wp.func
 def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Penalty of rapid stepping. It is the sum over paws of max(0, touchdowns in the last 0.75 s - threshold)."""
+    """Penalty of rapid stepping: sum over paws of max(0, touchdowns in the last 0.75 s - threshold)."""
     total = float(0.0)
     for k in range(4):
         total += wp.max(state.recent_steps[k] - threshold, 0.0)
@@ -129,7 +129,7 @@ def clamped_rapid_stepping(robot: RobotView, state: VelocityState, threshold: fl
 
 @wp.func
 def restless_stand(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of lifted paws when commanded to stand. It is the number of paws off the ground, 0 to 4."""
+    """Penalty of lifted paws when commanded to stand: number of paws off the ground, 0 to 4."""
     return float(4 - robot.contacts) * (1.0 - moving(state))
 
 
@@ -149,7 +149,7 @@ def foot_clearance(robot: RobotView, state: VelocityState, target_height: float)
 
 @wp.func
 def slip(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of paws that slip on the ground. It is the sum of their squared horizontal speeds [m^2/s^2]."""
+    """Penalty of paws that slip on the ground: sum of their squared horizontal speeds [m^2/s^2]."""
     total = float(0.0)
     for k in range(4):
         total += robot.contact[k] * (
@@ -160,7 +160,7 @@ def slip(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def touchdown(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of hard touchdowns. It is the sum over paws that touch down of squared downward speed [m^2/s^2]."""
+    """Penalty of hard touchdowns: sum over paws that touch down of squared downward speed [m^2/s^2]."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * robot.touchdown_speed[k] * robot.touchdown_speed[k]

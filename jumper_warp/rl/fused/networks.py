@@ -35,7 +35,7 @@ class Layer(NamedTuple):
 
 
 class FusedLayout:
-    """Places of all parameters in the kernels' zero-padded vector of parameters, and in the sums of their gradients.
+    """Offsets of all parameters in the kernels' zero-padded vector of parameters, and in the sums of their gradients.
 
     `table` (3, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in the
     padded vector, the place of its mirror image, and the image's sign; 0 is a place that nothing uses.

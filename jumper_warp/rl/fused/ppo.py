@@ -1,4 +1,4 @@
-"""PPO with the fused collector and update."""
+"""PPO trainer whose rollout and update run in fused Triton kernels."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class TurnCfg:
 
 @dataclass(frozen=True)
 class AttitudeResetCfg:
-    """Ranges of the state at the start of an episode, in any orientation; angles in degrees."""
+    """Ranges of the robot's state at the start of turning in flight, in any orientation; angles in degrees."""
 
     episode: Pair = (2.0, 4.0)
     """[s] Length of an episode, sampled so that worlds do not reset all at once."""

@@ -124,7 +124,7 @@ class StartProbability:
 
 @dataclass(frozen=True)
 class ResetCfg:
-    """Start of episodes (reference state initialisation): start modes and ranges of their states; angles in degrees."""
+    """Start of jumps (reference state initialisation): start modes and ranges of their states; angles in degrees."""
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"

@@ -1,4 +1,4 @@
-"""Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as in the authors' sequel, without springs.
+"""Tasks of jumps on Mars (3.71 m/s^2) as in the authors' sequel, without springs: 24.8 N m, transversal kp 20 N m/rad.
 
 The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose filter. Each filter
 has a task. Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to
@@ -26,7 +26,7 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return motor settings of jumps on Mars: transversal kp KP, limit TORQUE; lateral_torque: lateral limit [N m]."""
+    """Return motors for jumps on Mars: transversal kp and torque limit of the sequel; lateral_torque: limit [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 

@@ -74,7 +74,7 @@ class CommandCfg:
 
 @dataclass(frozen=True)
 class VelocityResetCfg:
-    """Ranges of the state at the start of an episode; angles in degrees."""
+    """Ranges of the robot's state at the start of an episode of velocity tracking; angles in degrees."""
 
     episode: float = 20.0
     """[s] Length of an episode."""

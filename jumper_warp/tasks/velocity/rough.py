@@ -32,7 +32,7 @@ STEPS_UP = (
 
 
 def velocity_rough() -> TaskCfg:
-    """Return the task of velocity tracking on a terrain map with the kinds of ground in `GROUNDS`."""
+    """Return the task of velocity tracking on a terrain map of slopes, steps and uneven ground (`GROUNDS`)."""
     flat = velocity_flat()
     task = replace(
         flat,

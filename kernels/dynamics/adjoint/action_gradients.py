@@ -59,7 +59,7 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the base's multipliers, accelerations and end velocities, constants of its virtual power in a step.
+    """Return the base's adjoint multipliers, accelerations and end velocities, held constant in its virtual power.
 
     The step takes dt [s], from state `base` to `end`. virtual_*: multipliers, body axes.
     """
@@ -78,7 +78,7 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's multipliers, motor motion and contact impulse, constants of its virtual power in a step.
+    """Return a leg's adjoint multipliers, motor motion and contact impulse, held constant in its virtual power.
 
     rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s].
     """

@@ -99,7 +99,7 @@ def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adj
 
 @wp.func
 def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
-    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `filter_leg`: cotangent . (filtered targets)."""
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `filter_leg`: dot(cotangent, filtered targets)."""
     return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 

@@ -213,7 +213,7 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return the base's multipliers and motion in a recorded step, constants of its virtual power.
+    """Return the base's adjoint multipliers and motion in a recorded step, held constant in its virtual power.
 
     i: entry of the step, of dt [s], in the record; base: state at its start.
     """
@@ -225,7 +225,7 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's multipliers, motor motion and contact impulse in a recorded step, constants of its virtual power.
+    """Return a leg's adjoint multipliers, motion and contact impulse in a recorded step, constant in its virtual power.
 
     step: its number in the rollout; dt [s]; i: its entry in the record.
     """
@@ -240,7 +240,7 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Multipliers of a step's equations of motion and contact laws, and gradients w.r.t. the velocities before it."""
+    """Adjoint multipliers of a step's motion and contact equations, and gradients w.r.t. the velocities before it."""
 
     base: BaseWeights
     leg: LegWeights
@@ -254,7 +254,7 @@ def find_weights(
     record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
     law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
-    """Return the multipliers of a step's motion and contact equations, from the gradients w.r.t. its end velocities.
+    """Return adjoint multipliers of a step's motion and contact equations, from gradients w.r.t. its end velocities.
 
     Like `find_multipliers`, with a thread per leg. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, in the
     body axes of the step's start. rate_cotangent: w.r.t. the motors' rates. i: the step's entry in the record.

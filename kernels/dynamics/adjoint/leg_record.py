@@ -46,7 +46,7 @@ class LegRecord:
 
 @wp.struct
 class BaseWeights:
-    """Solved multipliers of the base's equations of motion in a step, for the reverse pass, body axes."""
+    """Solved adjoint multipliers of the base's equations of motion in a step, body axes."""
 
     lin: vec3  # virtual velocity, see `virtual_power`
     ang: vec3  # virtual angular velocity
@@ -55,7 +55,7 @@ class BaseWeights:
 
 @wp.struct
 class LegWeights:
-    """Solved multipliers of a leg's equations of motion and of its paw's contact law, for the reverse pass."""
+    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step."""
 
     rates: vec3  # virtual rates of the motors
     law: vec3  # multiplier of the contact law, body axes
@@ -277,7 +277,7 @@ def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow
 
 @wp.func
 def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegWeights:
-    """Return the recorded multipliers of a leg's equations of motion and of its paw's contact law."""
+    """Return the recorded adjoint multipliers of a leg's equations of motion and of its paw's contact law."""
     weights = LegWeights()
     weights.rates = get_vec(record, entry, LEG_WEIGHTS, world, leg)
     weights.law = get_vec(record, entry, LEG_WEIGHTS + 3, world, leg)
@@ -286,14 +286,14 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write the multipliers of a leg's equations of motion and of its paw's contact law to the record."""
+    """Write the adjoint multipliers of a leg's equations of motion and of its paw's contact law to the record."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 
 
 @wp.func
 def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
-    """Return the recorded multipliers of the base's equations of motion."""
+    """Return the recorded adjoint multipliers of the base's equations of motion."""
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
@@ -305,7 +305,7 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
 
 @wp.func
 def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWeights):
-    """Write the multipliers of the base's equations of motion to the record."""
+    """Write the adjoint multipliers of the base's equations of motion to the record."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)

@@ -1,4 +1,4 @@
-"""Recomputation of a step, and the multipliers of its equations of motion and contact laws; see `step_adjoint`.
+"""Recomputation of a step, and adjoint multipliers of its equations of motion and contact laws; see `step_adjoint`.
 
 `legs` is scratch of the thread, (4,), legs FL, FR, BL, BR.
 """
@@ -49,7 +49,7 @@ class ReplayedStep:
 
 @wp.struct
 class LegReverse:
-    """Values of a leg during the reverse pass: gradients w.r.t. its motors, multipliers, and its paw's contact.
+    """Values of a leg during the reverse pass: gradients w.r.t. its motors, adjoint multipliers, its paw's contact.
 
     Vectors of motors are lateral, outer, inner.
     """
@@ -65,7 +65,7 @@ class LegReverse:
 
 @wp.struct
 class Multipliers:
-    """Multipliers of the base's equations of motion in a step, and the gradients from which they are solved.
+    """Adjoint multipliers of the base's equations of motion in a step, and the gradients they are solved from.
 
     The multipliers are m, the gradients y in M m = y (M: mass matrix); body axes.
     """
@@ -80,7 +80,7 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve for the multipliers of the equations of motion of base and motors, contact laws aside.
+    """Solve for the adjoint multipliers of the equations of motion of base and motors, contact laws aside.
 
     Solves M m = y (`Multipliers`) for y = *_cotangent, `legs[k].rates`; returns the base's m, writes the motors'.
     """
@@ -189,7 +189,7 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 @wp.func
 def solve_laws(legs: wp.array(dtype=LegReverse)):
-    """Solve for the multipliers of all paws' contact laws, one linear system, by Gaussian elimination.
+    """Solve for the adjoint multipliers of all paws' contact laws, one linear system, by Gaussian elimination.
 
     `multiplier` of each leg is the gradient w.r.t. its paw's impulse before, and the multiplier (0 if separated) after.
     """
@@ -271,7 +271,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Add the part of the contact laws to the multipliers of the equations of motion.
+    """Add the contribution of the paws' contact laws to the adjoint multipliers of the equations of motion.
 
     Returns those of the base; updates the motors' in `legs`, which holds the laws.
     """
@@ -303,7 +303,7 @@ def find_multipliers(
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's motion and contact equations, from the gradients w.r.t. its end velocities.
+    """Return adjoint multipliers of a step's motion and contact equations, from gradients w.r.t. its end velocities.
 
     See `step_adjoint`. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, body axes. legs: `rates` are the
     gradients w.r.t. the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are
@@ -318,7 +318,7 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the base's multipliers and motion in the recomputed step `at`, constants of its virtual power.
+    """Return the base's adjoint multipliers and motion in the recomputed step `at`, held constant in its virtual power.
 
     m: from `find_multipliers`.
     """
@@ -331,7 +331,7 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's multipliers, motion and contact impulse in a recomputed step, constants of its virtual power.
+    """Return a leg's adjoint multipliers, motion and impulse in a recomputed step, held constant in its virtual power.
 
     k: leg 0 to 3. Needs the results of `find_multipliers`.
     """

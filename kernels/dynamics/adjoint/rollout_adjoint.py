@@ -39,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
-    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `row_base`: cotangent . (base state of a row)."""
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `row_base`: dot(cotangent, base state of a row)."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
         wp.dot(cotangent.pos, base.pos)
@@ -53,7 +53,7 @@ def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, c
 def store_adjoint_scalar(
     orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
 ) -> real:
-    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `store_row_base`: cotangents . (stored velocities).
+    """Return a scalar whose gradient (`wp.grad`) is the adjoint of `store_row_base`: dot(cotangents, velocities).
 
     orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
     """

@@ -42,7 +42,7 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """Multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
+    """Adjoint multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
 
     Axes are those of the base at the start of the step.
     """
@@ -57,7 +57,7 @@ class BaseFactors:
 
 @wp.struct
 class LegFactors:
-    """Multipliers, motor motion and contact of a leg, held constant while its virtual power is differentiated.
+    """Adjoint multipliers, motor motion and contact of a leg, constant while its virtual power is differentiated.
 
     Vectors are lateral, outer, inner, or those of its paw's contact.
     """
@@ -397,7 +397,7 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base's part of a step's virtual power, plus `cotangent` . (gravity and velocities in rotated axes).
+    """Return the base's part of a step's virtual power, plus dot(`cotangent`, gravity and velocities in rotated axes).
 
     gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
     axes; orientation: xyzw.

@@ -1,4 +1,4 @@
-"""Products: layers and whole networks, forward and backward, and the gradients of their weights.
+"""Triton kernels of layers and whole networks: forward and backward pass, and gradients of the weights.
 
 Tiles: BM rows, BN columns, BK terms of a product per pass. A row is a sample.
 """

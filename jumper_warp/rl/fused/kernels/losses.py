@@ -1,4 +1,4 @@
-"""The policy's mean action, and the losses of actor and critic with their gradients."""
+"""Triton kernels of the policy's mean action, and of the losses of actor and critic with their gradients."""
 
 import triton
 import triton.language as tl

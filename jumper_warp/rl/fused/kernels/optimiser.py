@@ -1,4 +1,4 @@
-"""The sum of the gradients over all splits of the samples, and a step of Adam."""
+"""Triton kernels that sum the gradients over all splits of the samples, and take a step of Adam."""
 
 import triton
 import triton.language as tl

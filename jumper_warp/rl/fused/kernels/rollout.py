@@ -1,4 +1,4 @@
-"""A policy step of the rollout: observations, actions, and results of the environment."""
+"""Triton kernels of a rollout's policy step: normalised observations, sampled actions, recorded results."""
 
 import triton
 import triton.language as tl

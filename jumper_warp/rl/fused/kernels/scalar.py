@@ -1,4 +1,4 @@
-"""Constants and functions of numbers that several kernels use."""
+"""Constants and elementwise functions that several Triton kernels use."""
 
 import triton
 import triton.language as tl
