@@ -180,15 +180,19 @@ class LeastSquares:
         """Return the normal equations at a point with derivatives that exclude jumps of the residuals.
 
         Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
-        forward and the backward difference, so the smaller one is taken. normal: from forward differences.
+        forward and the backward difference, so the smaller one is taken. Both are computed at the point: entries of
+        Jacobians at two points, mixed, would determine combinations of parameters that neither determines. normal:
+        equations at the point, whose derivatives are kept where both differences diverge.
         """
         linearised = []
-        for motion, start, change, ahead in zip(
-            self.motions, point.starts, self._change, normal.linearised, strict=True
-        ):
-            behind = motion.linearise(self.replay, point.z, start, -change).jacobian
-            smaller = np.abs(behind) < np.abs(ahead.jacobian)  # False where a world diverges
-            linearised.append(Linearised(ahead.residual, np.where(smaller, behind, ahead.jacobian)))
+        for motion, start, change, old in zip(self.motions, point.starts, self._change, normal.linearised, strict=True):
+            ahead, behind = (
+                motion.linearise(self.replay, point.z, start, sign * change).jacobian for sign in (1.0, -1.0)
+            )
+            smaller = np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
+            for other in (behind, old.jacobian):  # where a world diverges
+                smaller = np.where(np.isfinite(smaller), smaller, other)
+            linearised.append(Linearised(old.residual, smaller))
         return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
