@@ -23,6 +23,10 @@ CHANGE = 0.01
 """Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
 the accuracy, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
+FRICTION = "paw_friction"
+"""Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. Costs are compared at
+its values `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
+FRICTION_MOVES = np.linspace(-2.0, 2.0, 9)
 
 
 @dataclass
@@ -227,18 +231,19 @@ class LeastSquares:
         normal.cost += normal.data_cost
         return normal
 
-    def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
-        """Return the best point for several values of one parameter, when all other unknowns follow to first order.
+    def scan(
+        self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray
+    ) -> tuple[list[Point], np.ndarray]:
+        """Return points (K) for several values of one parameter, and their costs (K,).
 
-        With its cost. index: of the parameter; moves: changes of its z, (K,).
+        All other unknowns follow to first order. index: of the parameter; moves: changes of its z, (K,).
         """
         covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
         along = covariance[:, index] / covariance[index, index]
         z = np.clip(point.z + moves[:, None] * along, self._low, self._high)
         starts = normal.following(point.starts, z - point.z)
-        costs = self.costs(z, starts)
-        best = int(np.argmin(costs))
-        return Point(z[best], [start[best] for start in starts]), float(costs[best])
+        points = [Point(z[k], [start[k] for start in starts]) for k in range(len(moves))]
+        return points, self.costs(z, starts)
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
         """Return the normal equations after a step, with Jacobians updated by Broyden's formula.
