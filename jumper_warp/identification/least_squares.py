@@ -23,6 +23,10 @@ CHANGE = 0.01
 """Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
 the accuracy, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
+FINAL_CHANGE = 0.03
+"""Step of the final finite differences over other ones: jumps of the residuals on both sides of the minimum lie outside
+it. Steps 3 times longer or shorter change standard deviations by less than 0.5 % (robots 5 to 8 of the stream
+"development" of `experiments/identification_starts.py`)."""
 FRICTION = "paw_friction"
 """Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. Costs are compared at
 its values `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
@@ -184,14 +188,16 @@ class LeastSquares:
         """Return the normal equations at a point with derivatives that exclude jumps of the residuals.
 
         Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
-        forward and the backward difference, so the smaller one is taken. Both are computed at the point: entries of
+        forward and the backward difference, so the smaller one is taken; steps are short, as jumps on both sides would
+        determine combinations of parameters that the motions leave open. Both are computed at the point: entries of
         Jacobians at two points, mixed, would determine combinations of parameters that neither determines. normal:
         equations at the point, whose derivatives are kept where both differences diverge.
         """
         linearised = []
         for motion, start, change, old in zip(self.motions, point.starts, self._change, normal.linearised, strict=True):
             ahead, behind = (
-                motion.linearise(self.replay, point.z, start, sign * change).jacobian for sign in (1.0, -1.0)
+                motion.linearise(self.replay, point.z, start, sign * FINAL_CHANGE * change).jacobian
+                for sign in (1.0, -1.0)
             )
             smaller = np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
             for other in (behind, old.jacobian):  # where a world diverges
