@@ -15,8 +15,9 @@ from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.results import CONFIDENCE, Identification
 from jumper_warp.utils.runtime import configure_device
 
-Stream = Literal["development", "evaluation"]
-STREAMS: dict[Stream, int] = {"development": 1, "evaluation": 2}  # First word of the seeds
+Stream = Literal["development", "examined", "evaluation"]
+STREAMS: dict[Stream, int] = {"development": 1, "examined": 2, "evaluation": 3}
+"""First word of the seeds. Fits of the stream "examined" were looked at when the derivatives were improved."""
 FAR = ("base_mass", "link_mass", "kp", "kd", "motor_friction", "knee_damping", "paw_friction")
 NEAREST, FARTHEST = 1.0, 2.0  # [1] Range of the distance of each of these quantities, in standard deviations of priors
 OWN, MOST = 0.5, 2.5  # [1] Standard deviation of each parameter around it, and limit, in the same unit

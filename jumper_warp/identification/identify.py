@@ -17,7 +17,15 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.identification.consistency import contradictions, residual_tests, without
-from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
+from jumper_warp.identification.least_squares import (
+    FRICTION,
+    FRICTION_MOVES,
+    LeastSquares,
+    NormalEquations,
+    Point,
+    Trial,
+    replace_residuals,
+)
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
@@ -49,10 +57,6 @@ MAX_STARTS = 4  # largest number of starts; two are enough if they agree and all
 DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
 """Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
 Largest displacement of a parameter, in standard deviations of its prior."""
-FRICTION = "paw_friction"
-"""Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
-tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
-FRICTION_MOVES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
 MAX_STEPS = 40  # largest number of Levenberg-Marquardt steps in a stage
 
 
@@ -194,9 +198,10 @@ class Descent:
         point, normal = self.minimise(problem, point, normal)
         names = problem.parameters.names
         if FRICTION in names:
-            moved, cost = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
-            if cost < normal.cost - CONVERGED * problem.scale(normal):
-                point, normal = self.minimise(problem, moved, problem.normal(moved))
+            moved, costs = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
+            best = int(np.argmin(costs))
+            if costs[best] < normal.cost - CONVERGED * problem.scale(normal):
+                point, normal = self.minimise(problem, moved[best], problem.normal(moved[best]))
         return Minimum(point, normal)
 
 

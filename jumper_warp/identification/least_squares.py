@@ -23,6 +23,14 @@ CHANGE = 0.01
 """Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
 the accuracy, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
+FINAL_CHANGE = 0.03
+"""Step of the final finite differences over other ones: jumps of the residuals on both sides of the minimum lie outside
+it. Steps 3 times longer or shorter change standard deviations by less than 0.5 % (robots 5 to 8 of the stream
+"development" of `experiments/identification_starts.py`)."""
+FRICTION = "paw_friction"
+"""Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. Costs are compared at
+its values `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
+FRICTION_MOVES = np.linspace(-2.0, 2.0, 9)
 
 
 @dataclass
@@ -180,15 +188,21 @@ class LeastSquares:
         """Return normal equations at a point with derivatives that ignore discontinuities of the residuals (impacts).
 
         Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
-        forward and the backward difference, so the smaller one is taken. normal: from forward differences.
+        forward and the backward difference, so the smaller one is taken. Steps are short, because a jump on each side
+        would enlarge both. Both differences are computed at the point: a mixture of Jacobians at two points determines
+        combinations of parameters that neither does. normal: equations at the point, whose derivatives are kept where
+        both differences diverge.
         """
         linearised = []
-        for motion, start, change, ahead in zip(
-            self.motions, point.starts, self._change, normal.linearised, strict=True
-        ):
-            behind = motion.linearise(self.replay, point.z, start, -change).jacobian
-            smaller = np.abs(behind) < np.abs(ahead.jacobian)  # False where a world diverges
-            linearised.append(Linearised(ahead.residual, np.where(smaller, behind, ahead.jacobian)))
+        for motion, start, change, old in zip(self.motions, point.starts, self._change, normal.linearised, strict=True):
+            ahead, behind = (
+                motion.linearise(self.replay, point.z, start, sign * FINAL_CHANGE * change).jacobian
+                for sign in (1.0, -1.0)
+            )
+            smaller = np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
+            for other in (behind, old.jacobian):  # where a world diverges
+                smaller = np.where(np.isfinite(smaller), smaller, other)
+            linearised.append(Linearised(old.residual, smaller))
         return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
@@ -223,18 +237,19 @@ class LeastSquares:
         normal.cost += normal.data_cost
         return normal
 
-    def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
-        """Try several values of one parameter, with all other unknowns refitted to first order; return the best point.
+    def scan(
+        self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray
+    ) -> tuple[list[Point], np.ndarray]:
+        """Try several values of one parameter, all other unknowns refitted to first order; return (points, costs).
 
-        With its cost. index: of the parameter; moves: changes of its z, (K,).
+        index: of the parameter; moves: changes of its z, (K,). Points are a list of K, costs have shape (K,).
         """
         covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
         along = covariance[:, index] / covariance[index, index]
         z = np.clip(point.z + moves[:, None] * along, self._low, self._high)
         starts = normal.following(point.starts, z - point.z)
-        costs = self.costs(z, starts)
-        best = int(np.argmin(costs))
-        return Point(z[best], [start[best] for start in starts]), float(costs[best])
+        points = [Point(z[k], [start[k] for start in starts]) for k in range(len(moves))]
+        return points, self.costs(z, starts)
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
         """Return the normal equations after a step, with Jacobians updated by Broyden's formula.

@@ -10,10 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jumper_warp.identification.consistency import FitTest, parameter_tests, residual_tests
-from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point
+from jumper_warp.identification.least_squares import FRICTION, FRICTION_MOVES, LeastSquares, NormalEquations, Point
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.identification.uncertainty import Direction, mismatch_factor, systematic_std, weak_directions
+from jumper_warp.identification.uncertainty import (
+    Direction,
+    mismatch_factor,
+    systematic_std,
+    trapped_variance,
+    weak_directions,
+)
 from jumper_warp.robot.values import RobotValues
 
 CONFIDENCE = 1.959964  # Standard deviations on either side of a 95 % interval
@@ -93,7 +99,9 @@ class Identification:
     mismatch: float  # [1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits
     systematic: np.ndarray
     """(P,) Standard deviations of z from contradictions between channels and motions; 0 if the model fits."""
-    spread: np.ndarray  # (P,) Standard deviations of z between the minima of all starts, weighed by their likelihood
+    spread: np.ndarray
+    """(P,) Standard deviations of z between the minima of all starts, and between paws that stick and slip, weighed by
+    likelihood."""
     starts: tuple[Start, ...]  # result of each start of the optimisation, best first
     tests: tuple[FitTest, ...]  # tests of the fit of each channel of each motion, and of each motion
     chi2: float  # [1] Mean squared residual of the data over the noise
@@ -211,6 +219,22 @@ def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
     return errors
 
 
+def trapped_spread(problem: LeastSquares, minimum: Minimum, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (P,) of z that the linear model misses as a paw may stick instead of slip.
+
+    covariance: of the linear model, (P, P).
+    """
+    point, normal = minimum
+    if FRICTION not in problem.parameters.names:
+        return np.zeros(len(point.z))
+    index = problem.parameters.names.index(FRICTION)
+    points, costs = problem.scan(point, normal, index, FRICTION_MOVES)
+    moves = np.array([moved.z[index] - point.z[index] for moved in points])
+    variance = covariance[index, index]
+    missed = trapped_variance(moves, (costs - normal.cost) / problem.scale(normal), math.sqrt(variance))
+    return math.sqrt(missed) * np.abs(covariance[:, index]) / variance
+
+
 def summarise(
     problem: LeastSquares, minima: Sequence[Minimum], steps: Sequence[DescentStep], effort: Callable[[], Effort]
 ) -> Identification:
@@ -243,7 +267,7 @@ def summarise(
         covariance=covariance,
         mismatch=mismatch,
         systematic=systematic,
-        spread=np.sqrt(weight @ distance**2),
+        spread=np.sqrt(weight @ distance**2 + trapped_spread(problem, minima[0], covariance) ** 2),
         starts=(),
         tests=(*residual_tests(problem, normal), *(t for _, t in parameter_tests(problem, normal, mismatch))),
         chi2=sum(error.cost for error in errors) / problem.count,

@@ -63,6 +63,18 @@ def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
     return float(np.sqrt(excess)) if excess > 1.0 + 6.0 * np.sqrt(2.0 / len(squares)) else 1.0
 
 
+def trapped_variance(moves: np.ndarray, excess: np.ndarray, std: float) -> float:
+    """Return the variance of a parameter around its fit that the linear model's standard deviation `std` misses.
+
+    While a paw slips, its friction is determined; yet a greater friction, at which it sticks, may fit as well. The
+    parameter's density is that of the linear model, plus what other values' likelihoods exceed it. moves: changes of
+    the parameter from the fit in equal steps, (K,), in the unit of std. excess: cost above the fit's at each, (K,).
+    """
+    likelihood = np.exp(-0.5 * np.maximum(excess, 0.0))
+    missed = np.maximum(likelihood - np.exp(-0.5 * (moves / std) ** 2), 0.0) * np.gradient(moves)
+    return float(missed @ moves**2 / (std * np.sqrt(2.0 * np.pi) + missed.sum()))
+
+
 def autocorrelation(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Return the common autocorrelation [1] of series of residuals at lags 1, 2, ... up to where noise dominates.
 

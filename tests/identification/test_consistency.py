@@ -10,7 +10,7 @@ from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters
 from jumper_warp.identification.recording import measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
-from jumper_warp.identification.residuals import MotionResiduals
+from jumper_warp.identification.residuals import Linearised, MotionResiduals
 from jumper_warp.identification.results import starts_agree
 
 
@@ -83,3 +83,37 @@ def test_a_motor_whose_gain_changed_between_motions_contradicts_the_others_most(
     assert set(list(failed)[:2]) == {("described", "FL_outer"), ("stiffer", "FL_outer")}
     for left_out, other in (("stiffer", 0.0), ("described", 0.2)):
         assert (point.z + without(normal, failed[left_out, "FL_outer"]))[index] == pytest.approx(other, abs=0.04)
+
+
+def test_final_derivatives_do_not_depend_on_those_of_an_earlier_point():
+    parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity in ("kp", "kd")))
+    replay, rng = MotionReplay(threads=1), np.random.default_rng(3)
+    plan, robots = sample_plan("hung chirp", rng, seconds=0.5), parameters.robots(np.zeros((1, len(parameters))))
+    motion = measure(plan, "hung", replay_plan(replay, plan, robots), robots, rng)
+    problem = LeastSquares(parameters, [MotionResiduals(motion, parameters, NoiseLevels(), replay.description)], replay)
+    point = problem.nominal_point()
+    normal = problem.normal(point)
+    old = problem.assemble(point, [Linearised(each.residual, 0.5 * each.jacobian) for each in normal.linearised])
+    information = problem.without_jumps(point, old).information()
+    np.testing.assert_allclose(information, normal.information(), atol=0.01 * np.abs(information).max())
+
+
+class JumpingResiduals:
+    """Residuals (100,) equal to z, with a jump of 0.01 at 0.0005 on either side of 0."""
+
+    start_size, valid = 1, np.ones((100, 1), bool)
+
+    def linearise(self, replay, z, start, change):
+        values = np.array([z[0], z[0] + change[0]])
+        residual, ahead = values + 0.01 * np.sign(values) * (np.abs(values) > 0.0005)
+        slope = np.full(100, (ahead - residual) / change[0])
+        return Linearised(np.full(100, residual), np.column_stack([slope, np.zeros(100)]))
+
+
+def test_final_derivatives_exclude_jumps_on_both_sides():
+    problem = LeastSquares(jumper_parameters(["latency"]), [JumpingResiduals()], MotionReplay(threads=1))
+    point = problem.nominal_point()
+    smooth = problem.normal(point)  # by the first, shortest step; sets the next one to 0.01 / sqrt(1 + 100)
+    assert smooth.information()[0, 0] == pytest.approx(100.0)
+    assert problem.motions[0].linearise(None, point.z, point.starts[0], problem._change[0]).jacobian[0, 0] > 10.0
+    assert problem.without_jumps(point, smooth).information()[0, 0] == pytest.approx(100.0)

@@ -5,7 +5,7 @@ import pytest
 
 from jumper_warp.identification.least_squares import NormalEquations
 from jumper_warp.identification.residuals import Linearised
-from jumper_warp.identification.uncertainty import systematic_std
+from jumper_warp.identification.uncertainty import systematic_std, trapped_variance
 
 PARAMETERS, ROWS, CHANNELS, MOTIONS = 5, 60, 4, 3
 CHANNEL = np.arange(CHANNELS).repeat(ROWS // CHANNELS)  # (ROWS,) channel of each residual of a motion
@@ -66,3 +66,24 @@ def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, rto
                 changes.append(refit.solve(mask)[0] - best)
         variance += (len(changes) - 1) / len(changes) * np.square(changes).sum(0)
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=rtol)
+
+
+MOVES = np.linspace(-2.0, 2.0, 9)
+
+
+@pytest.mark.parametrize("std", [0.05, 0.3, 1.0])
+def test_linear_model_misses_no_variance_of_a_normal_parameter(std):
+    assert trapped_variance(MOVES, (MOVES / std) ** 2, std) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_linear_model_misses_the_variance_of_paws_that_stick_at_greater_friction():
+    """A slipping paw bounds its friction from below, with std 0.05; above the fit, the cost rises to 1, then slowly."""
+
+    def excess(moves):
+        return np.where(moves < 0.0, (moves / 0.05) ** 2, np.minimum((moves / 0.05) ** 2, 1.0 + moves**2))
+
+    fine = np.linspace(-2.0, 4.0, 60_001)
+    density = np.exp(-0.5 * excess(fine))
+    exact = np.sum(density * fine**2) / np.sum(density)  # 0.60^2 around the fit; linear model: 0.05^2
+    assert exact > 0.3
+    assert np.sqrt(trapped_variance(MOVES, excess(MOVES), 0.05)) == pytest.approx(np.sqrt(exact), rel=0.2)
