@@ -47,14 +47,17 @@ def finished(folder: Path, task: str, arm: str) -> list[dict[str, Any]]:
 
 
 def cell(folder: Path, task: str, arm: str, key: str) -> str:
-    """Format a metric of an ablation (arm), mean and range over seeds; GAP: no seed has it, NEVER: none reached it."""
+    """Format a metric of an ablation (arm): mean and range over seeds, and their number if some did not reach it.
+
+    GAP: no seed has it, NEVER: none reached it.
+    """
     seeds = finished(folder, task, arm)
     found = [values[key] for values in seeds if values.get(key) is not None]
     if not found:
         return NEVER if seeds and key.startswith("steps") else GAP
     values = np.array(found) * (1.0e-6 if key.startswith("steps") else 1.0)
     spread = f" ({values.min():.3g}–{values.max():.3g})" if len(values) > 1 else ""
-    return f"{values.mean():.3g}{spread}, {len(values)} of {len(seeds)} seeds"
+    return f"{values.mean():.3g}{spread}" + f", {len(values)} of {len(seeds)}" * (len(values) < len(seeds))
 
 
 def results_table(folder: Path) -> str:
