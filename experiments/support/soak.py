@@ -268,11 +268,8 @@ def soak_tasks(args: SoakArgs, folder: Path) -> dict:
     parts = [json.loads(line) for line in path.read_text().splitlines()] if args.max_seconds and path.is_file() else []
     names = task_names() if args.task == "all" else (str(args.task),)
     while True:
-        begin, seed, task = (
-            time.perf_counter(),
-            args.seed + len(parts),
-            hardest(make_task(names[len(parts) % len(names)])),
-        )
+        begin, seed = time.perf_counter(), args.seed + len(parts)
+        task = hardest(make_task(names[len(parts) % len(names)]))
         torch.manual_seed(seed)
         make = partial(Env, task, args.num_envs, seed=seed, device=args.device, threads=args.threads)
         parts.append(soak_env(make(), args) | {"task": task.name, "seed": seed, "envs": args.num_envs})

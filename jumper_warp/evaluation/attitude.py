@@ -160,7 +160,7 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
 
 @dataclass(frozen=True)
 class AttitudeFlags:
-    """Flags of `jumper evaluate` for turns about the body's axes, in both directions, from rest in the default pose."""
+    """Flags of `jumper evaluate` for turns in free flight about the body's axes, from rest in the default pose."""
 
     num_turns: int = 60  # Number of turns
     angle: float = 90.0  # [deg] Angle of every turn

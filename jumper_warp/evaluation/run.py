@@ -138,7 +138,7 @@ class Run(ABC):
 
     @property
     def condition_values(self) -> dict[str, Any]:
-        """Conditions by name, without unset ones; the latency is that simulated in all episodes so far."""
+        """Conditions of the evaluation by name, without unset ones; with the latencies of the episodes so far."""
         conditions, values = self.conditions, {**self.settings}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:

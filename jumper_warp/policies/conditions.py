@@ -81,9 +81,9 @@ class Conditions:
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
-        """Return the robot overlay: `robot`, else the overlay in a policy's configuration, else None (nominal robot).
+        """Return the robot overlay (values that differ from the description): of the file `robot`, else of the policy.
 
-        config: `Policy.config`. Raises InputError or OSError: the overlay cannot be used.
+        None: the described robot. config: `Policy.config`. Raises InputError or OSError: the overlay cannot be used.
         """
         if self.robot is not None:
             return load_overlay(self.robot)

@@ -1,4 +1,4 @@
-"""Writer of a URDF for a robot with other masses or motors, and of the loops that a URDF cannot hold."""
+"""Writer of a URDF with a robot's own masses and motors, and of a YAML file with its closed loops."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class RobotValues:
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of a robot description, by default the project's, for `count` equal robots."""
+        """Return the values of `count` equal robots as described (default: the Jumper); factors are 1, offsets 0."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
         single = cls(

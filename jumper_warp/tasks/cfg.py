@@ -265,7 +265,7 @@ class TaskCfg(Copyable):
         return tuple(term.name for term in self.terminations)
 
     def on_level_ground(self) -> TaskCfg:
-        """Return a copy of the task on a plane: without terrain, and without ground that resets sample."""
+        """Return the task on a plane: without terrain, and without platforms and blocks that resets sample."""
         if not hasattr(self.reset.settings, "on_level_ground"):
             return self
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))

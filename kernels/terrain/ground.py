@@ -43,7 +43,7 @@ class Ground:
 
 @wp.func
 def world_ground(ground: Ground, world: int) -> Ground:
-    """Return a copy of the ground whose `block` is the block of the world."""
+    """Return a copy of the ground with the obstacle (`block`) that stands in a world."""
     here = ground
     if ground.blocks.shape[0] > 0:
         here.block = ground.blocks[world]

@@ -80,9 +80,9 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve for the adjoint multipliers of the equations of motion of base and motors, contact laws aside.
+    """Return the adjoint multipliers of the base's equations of motion, and write those of the motors to `legs`.
 
-    Solves M m = y (`Multipliers`) for y = *_cotangent, `legs[k].rates`; returns the base's m, writes the motors'.
+    Solves M m = y (`Multipliers`) for y = *_cotangent, `legs[k].rates`. Laws of contact are not part of it.
     """
     m = Multipliers()
     m.lin_cotangent = lin_cotangent

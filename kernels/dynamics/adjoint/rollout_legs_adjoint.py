@@ -1,8 +1,8 @@
-"""Reverse pass of a rollout on GPUs, with four threads per world, one per leg; the last span of rows comes first.
+"""Reverse pass of a rollout on GPUs, with four threads per world, one per leg.
 
-Each span takes four launches: `replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel`
-runs backwards step by step; the two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all steps in
-parallel.
+The pass runs over spans, each of some trajectory rows, from the last span to the first. Each span takes four launches:
+`replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel` runs backwards step by step; the
+two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all steps in parallel.
 """
 
 import warp as wp
