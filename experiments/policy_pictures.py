@@ -27,6 +27,7 @@ from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
 from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import add_files
 from jumper_warp.robot.grounds import platform
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
@@ -45,11 +46,12 @@ TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
 
 @dataclass(frozen=True)
 class Shot:
-    """Motion that a policy performs in its picture: flags of `jumper play`, title and ground."""
+    """Motion that a policy performs in its picture: flags of `jumper play`, title, ground and friction."""
 
     flags: PlayFlags
     title: str
     ground: Callable[[], Any] = lambda: "plane"  # as in `build_model`
+    friction: float | None = None  # [1] of the paws (default: nominal)
 
 
 def heights(*values: float) -> HeightPlayFlags:
@@ -76,8 +78,8 @@ SHOTS = {
     "mars_vertical_jump_stock": Shot(heights(2.0), "Mars, stock robot: jump to 2 m"),
     "omnidirectional_jump": Shot(goal(-0.5, 0.5), "jump to a place 0.5 m back and 0.5 m to the left"),
     "sighted_jump": Shot(goal(1.3), "jump off a platform of 0.15 m that it sees", lambda: platform(-0.15, edge=0.4)),
-    "slippery_jump": Shot(goal(1.2), "jump to a place 1.2 m ahead, for slippery ground"),
-    "slippery_waiting_jump": Shot(goal(1.2), "wait, then jump to a place 1.2 m ahead, for slippery ground"),
+    "slippery_jump": Shot(goal(1.2), "friction 0.4: jump to a place 1.2 m ahead", friction=0.4),
+    "slippery_waiting_jump": Shot(goal(1.2), "friction 0.4: wait, then jump to a place 1.2 m ahead", friction=0.4),
     "vertical_jump": Shot(heights(1.0), "jump to a base height of 1 m"),
     "walking_flat": Shot(walk(0.8), "walk at 0.8 m/s"),
     "walking_rough": Shot(
@@ -111,7 +113,7 @@ def record(name: str) -> Recording:
         shot = SHOTS[name]
         run = EvaluationRun(name)
         log, ground = shot.flags.log(run.evaluation.prepare_task(run.task)), shot.ground()
-        env = run.env(log.count, ground=ground)
+        env = run.env(log.count, conditions=Conditions(friction=shot.friction), ground=ground)
     recorder = EnvRecorder(env, log, [0], ground=ground, notes={"task": name})
     run_evaluation(run.actor(env), env, log, on_step=recorder)
     return recorder.recording()

@@ -143,7 +143,8 @@ def check_numbers(settings: Any) -> None:
             if isinstance(number, float) and not math.isfinite(number):
                 raise InputError(f"--{flag.name} must be a finite number, got {number}")
             if isinstance(number, int | float) and abs(number) > limit:
-                raise InputError(f"--{flag.name} must be at most {limit:.10g} in size, got {number!s:.40}")
+                bound = f"at most {limit:.10g}" if number > 0 else f"at least {-limit:.10g}"
+                raise InputError(f"--{flag.name} must be {bound}, got {number!s:.40}")
 
 
 def option_of(arg: str) -> str:

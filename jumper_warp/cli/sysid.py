@@ -1,4 +1,4 @@
-"""`jumper sysid DATA ...`: identify the robot's parameters from recorded motions, plan such motions, fit one motor."""
+"""`jumper sysid`: identify the robot's parameters from recorded motions, plan such motions, fit one motor."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ class FinetuneCfg:
     device: str | None = None  # Warp device (default: a GPU if there is one)
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); results do not depend on it
     robot: Path | None = None
-    """Robot overlay file, as written by `jumper sysid`, to adapt to (default: the overlay of the training, if it had
-    one)."""
+    """Robot overlay file, as written by `jumper sysid fit`, to adapt to (default: the overlay of the training, if it
+    had one)."""
 
     def __post_init__(self) -> None:
         if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:

@@ -173,7 +173,7 @@ def load_overlay(path: Path) -> RobotOverlay:
 
     Raises InputError: it cannot be read, or is no overlay.
     """
-    content = read_json(path, "robot overlay, as jumper sysid writes it")
+    content = read_json(path, "robot overlay, as jumper sysid fit writes it")
     try:
         return RobotOverlay.from_json(content)
     except InputError as error:

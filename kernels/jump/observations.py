@@ -9,7 +9,7 @@ from .state import JumpState, commanded, goal_offset
 
 SIGHT_RANGE = wp.constant(2.0)  # [m] largest distance ahead or behind at which a block is observed
 vec7 = wp.types.vector(length=7, dtype=wp.float32)
-LANDING_HEIGHT = wp.constant(0.3)  # [m] of the base above the ground at the goal, at the estimated landing
+LANDING_HEIGHT = wp.constant(0.3)  # [m] of the base above the ground at the goal, at the ballistic landing
 
 
 @wp.func
@@ -52,14 +52,18 @@ def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Height errors [m]: highest base height so far, and ballistic estimate of the apex, less the commanded apex."""
+    """Height errors [m]: highest base height so far, and ballistic apex z + v_z^2 / 2g, less the commanded apex."""
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
     return wp.vec2(state.max_height - state.goal[2], apex - state.goal[2])
 
 
 @wp.func
 def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Horizontal vector from the estimated ballistic landing to the goal [m], ahead and to the left in the heading."""
+    """Horizontal vector from the ballistic landing to the goal [m], ahead and to the left in the heading.
+
+    The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
+    h, 0.3 m above the goal's ground.
+    """
     landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.gravity_magnitude)
     miss = rotate_yaw(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
     return wp.vec2(miss[0], miss[1])

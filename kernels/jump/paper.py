@@ -32,9 +32,9 @@ def jump_height(robot: RobotView, state: JumpState, std: float, scale: float) ->
 
 @wp.func
 def estimated_jump_height(robot: RobotView, state: JumpState, std: float, scale: float) -> float:
-    """Reward for a predicted apex of the base close to the commanded height, in flight before the apex.
+    """Reward for a ballistic apex of the base close to the commanded height, in flight before the apex.
 
-    It is phi_std + 3 psi_scale of the difference [m] between the ballistic estimate and the command.
+    It is phi_std + 3 psi_scale of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z if the base falls.
     """
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
@@ -50,9 +50,10 @@ def tracking(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def estimated_tracking(robot: RobotView, state: JumpState, std: float, std_wide: float, height: float) -> float:
-    """Reward for a predicted landing of the base close to the goal, in flight: phi_std + 0.1 phi_wide of the error [m].
+    """Reward for a ballistic landing of the base close to the goal, in flight: phi_std + 0.1 phi_wide of the error [m].
 
-    The ballistic landing is where the base falls through `height` [m] above the goal's ground.
+    The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
+    h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -108,7 +109,7 @@ def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float
 
 @wp.func
 def predicted_height_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float) -> bool:
-    """Terminate `steps` policy steps after takeoff if the predicted apex is more than `tolerance` [m] off the goal."""
+    """Terminate `steps` policy steps after takeoff if the ballistic apex is more than `tolerance` [m] off the goal."""
     if state.phase != FLIGHT or state.phase_steps != int(steps) or state.apex_passed != 0:
         return False
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)

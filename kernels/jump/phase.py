@@ -32,7 +32,7 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -
 
 @wp.func
 def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
-    """Return the horizontal distance [m] between the goal and the predicted ballistic landing of the base.
+    """Return the horizontal distance [m] between the goal and the ballistic landing of the base.
 
     The landing is where the base falls through `height` [m] above the goal's ground.
     """

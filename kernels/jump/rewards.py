@@ -2,8 +2,8 @@
 
 Penalties have negative weights in the tasks, unless their values are negative. Times are counted in policy steps of
 1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and scale_*: their widths, in the unit of their
-argument. shift [rad]: added to the default angles of transversal motors. waiting_scale: factor on rewards that do not
-need a jump, while a commanded jump has not begun.
+argument. shift [rad]: added to the default angles of transversal motors. waiting_scale [1]: factor, from the command to
+the takeoff, on rewards that need no jump.
 """
 
 import warp as wp
@@ -50,7 +50,7 @@ def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
     """Reward for a jump whose highest base height is close to the commanded one, given once, at the apex.
 
-    It is `height_closeness` of their difference [m].
+    It is phi_fine + 3 psi_sharp + phi_wide of their difference [m].
     """
     if state.at_apex == 0:
         return 0.0
@@ -61,9 +61,10 @@ def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp
 def estimated_jump_height(
     robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
 ) -> float:
-    """Reward for a predicted apex of the base close to the commanded height, in flight before the apex.
+    """Reward for a ballistic apex of the base close to the commanded height, in flight before the apex.
 
-    It is `height_closeness` of the difference [m] between the ballistic estimate and the command.
+    It is phi_fine + 3 psi_sharp + phi_wide of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z if the
+    base falls.
     """
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
@@ -77,7 +78,10 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Reward for little horizontal base speed: exp(-|v_xy| / speed_scale [m/s]), doubled after takeoff."""
+    """Reward for little horizontal base speed: exp(-|v_xy| / speed_scale [m/s]), doubled after takeoff.
+
+    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    """
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
     return (
         wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
@@ -86,7 +90,10 @@ def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, 
 
 @wp.func
 def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for a level base: Gaussian phi_std of the sine of the tilt [1] (horizontal part of projected gravity)."""
+    """Reward for a level base: Gaussian phi_std of the sine of the tilt [1] (horizontal part of projected gravity).
+
+    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    """
     return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * waiting_weight(
         state, waiting_scale
     )
@@ -94,7 +101,10 @@ def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: f
 
 @wp.func
 def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for a base that does not rotate: Gaussian phi_std of its angular speed [rad/s]."""
+    """Reward for a base that does not rotate: Gaussian phi_std of its angular speed [rad/s].
+
+    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    """
     return phi(wp.length(robot.ang_vel), std) * waiting_weight(state, waiting_scale)
 
 
@@ -102,7 +112,10 @@ def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_sca
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Reward for equal transversal and small lateral angles: phi(variance [rad^2]) phi(norm of lateral ones [rad])."""
+    """Reward for equal transversal and small lateral angles: phi(variance [rad^2]) phi(norm of lateral ones [rad]).
+
+    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    """
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
@@ -121,7 +134,7 @@ def joint_symmetry(
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
     """Reward for motor angles near a pose, except in flight: default pose, transversal angles plus `shift` [rad].
 
-    It is phi_std of the rms motor offset [rad].
+    It is phi_std of the rms motor offset [rad], multiplied by `waiting_scale` [1] from the command to the takeoff.
     """
     if state.phase == FLIGHT:
         return 0.0
@@ -160,10 +173,10 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
 def estimated_tracking(
     robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
-    """Reward for a predicted landing of the base close to the goal position, in flight.
+    """Reward for a ballistic landing of the base close to the goal, in flight.
 
-    It is phi_middle + 0.1 phi_wide + 0.3 phi_fine of their distance [m]. The ballistic landing is where the base falls
-    through `height` [m] above the goal's ground.
+    It is phi_middle + 0.1 phi_wide + 0.3 phi_fine of their distance [m]. The ballistic landing is p_xy + t v_xy with
+    t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -189,7 +202,10 @@ def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> f
 
 @wp.func
 def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Reward for equal transversal motor angles left and right: Gaussian phi_std of the rms difference [rad]."""
+    """Reward for equal transversal motor angles left and right: Gaussian phi_std of the rms difference [rad].
+
+    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    """
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0 and (m / 3) % 2 == 0:  # transversal motors of left legs; the right leg is 3 motors later

@@ -27,9 +27,10 @@ def missed_goal(robot: RobotView, state: JumpState, tolerance: float) -> bool:
 
 @wp.func
 def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float, height: float) -> bool:
-    """Terminate `steps` policy steps after takeoff if the predicted landing is more than `tolerance` [m] off the goal.
+    """Terminate `steps` policy steps after takeoff if the ballistic landing is more than `tolerance` [m] off the goal.
 
-    The prediction is ballistic. height [m]: of the base above the goal's ground at the landing.
+    The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
+    h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT or state.phase_steps != int(steps):
         return False
