@@ -129,7 +129,7 @@ def newest_name(folder: Path) -> str:
 
 
 def best_checkpoint(folder: Path) -> Path:
-    """Return the path of the checkpoint with the highest score, or of the last saved if none has one.
+    """Return the path of the checkpoint with the highest score, the last saved of equal ones or if none has a score.
 
     Raises CheckpointError: there is none.
     """
@@ -137,9 +137,10 @@ def best_checkpoint(folder: Path) -> Path:
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
-    """Return the file name of the checkpoint with the highest finite score in a manifest; None if there is none."""
-    scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
-    return max(scored, key=lambda name: manifest[name]["score"], default=None)
+    """Return the file name of a manifest's last checkpoint with the highest finite score; None without scores."""
+    scores = {name: entry["score"] for name, entry in manifest.items() if entry["score"] is not None}
+    scored = [name for name in reversed(scores) if math.isfinite(scores[name])]
+    return max(scored, key=scores.__getitem__, default=None)
 
 
 def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str, Any]]:

@@ -63,7 +63,10 @@ class Command(Copyable):
     """Functions that set a task's command from outside and resample it within an episode."""
 
     set: Function
-    """Function that sets a command: @wp.func (robot, scene: Scene, state, values: wp.vec4, heading [rad]) -> state."""
+    """Function that sets a command: @wp.func (robot, scene: Scene, state, values: wp.vec4, heading) -> state.
+
+    heading: yaw of the robot [rad], from which directions in `values` count.
+    """
     resample_due: Function | None = None
     """Condition to sample a new command in this step: @wp.func (state) -> bool; None: never."""
     resample: Function | None = None

@@ -31,7 +31,7 @@ SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
 STAYS = 0.6  # [m] horizontal distance up to which the moments are spread, since they would hide each other
 DRIFT = 0.15  # [m] horizontal distance up to which the picture shows the x axis; of each hop, up to which a robot stays
 TEXT = 0.14  # [m] height of a line of text above a robot
-IN_FRONT = 0.7  # [m] distance of the time axis of a robot that stays in place from the plane of the picture
+IN_FRONT = 0.7  # [m] distance of the axis of moments of a robot that stays in place from the plane of the picture
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
 MOST = 7  # largest number of moments in a picture
@@ -60,7 +60,7 @@ class Composition:
 
     @property
     def stays(self) -> bool:
-        """Whether the robot stays in place, so that the picture's horizontal axis is time, in order of the moments."""
+        """Whether the robot stays in place: the picture's horizontal axis is the order of the moments, not to scale."""
         return bool(self.shift.any())
 
     @property
@@ -285,11 +285,11 @@ def _shapes(scene: Composition) -> list[ShapeMesh]:
 
 
 def _lines(scene: Composition) -> list[Line]:
-    """Return the lines to draw: path of the base or time axis, bars at commanded heights, scale of height."""
+    """Return the lines to draw: path of the base or axis of moments, bars at commanded heights, scale of height."""
     low, high = scene.span()
     first, last = scene.frames[0], scene.frames[-1]
     if scene.stays:
-        axis = [[(low, 0.0), (high, 0.0)], [(high - 0.1, 0.03), (high, 0.0), (high - 0.1, -0.03)]]
+        axis = [[(low, 0.0), (high, 0.0)]]  # no arrow: it would suggest an even scale
         axis += [[(along, 0.03), (along, 0.0)] for along in scene.bases @ scene.right]
         paths = [np.stack([scene.point(x, scene.lowest + z, IN_FRONT) for x, z in path]) for path in axis]
         lines = [Line(path, BASE_COLOR) for path in paths]
@@ -317,7 +317,7 @@ def _ticks(scene: Composition) -> np.ndarray:
 def _labels(scene: Composition) -> list[Label]:
     """Return the labels: time (and base height of a jump) of each drawn robot, numbers of scale and bars.
 
-    Times are above the robots, or on the time axis of a robot that stays in place.
+    Times are above the robots, or on the axis of a robot that stays in place.
     """
     low, high = scene.span()
     jumps, labels = bool(scene.flights), []
@@ -333,7 +333,7 @@ def _labels(scene: Composition) -> list[Label]:
         if scene.stays:
             labels.append(Label(time, scene.point(base @ scene.right, scene.lowest - 0.03, IN_FRONT), "ma"))
     if scene.stays:
-        labels.append(Label("time", scene.point(low - 0.06, scene.lowest, IN_FRONT), "rm"))
+        labels.append(Label("time, not\nto scale", scene.point(low + 0.1, scene.lowest - 0.03, IN_FRONT), "ra"))
     labels += [Label(f"{z:g} m", scene.point(low - 0.06, z), "rm") for z in _ticks(scene)]
     labels += [Label(f"commanded {z:.2f} m", scene.point(high, z + 0.01), "rd") for z in scene.heights]
     return labels

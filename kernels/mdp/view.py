@@ -11,7 +11,11 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 @wp.struct
 class RobotView:
-    """State of one robot at the end of a policy step; legs FL, FR, BL, BR, motors of each lateral, outer, inner."""
+    """State of one robot at the end of a policy step; legs FL, FR, BL, BR, motors of each lateral, outer, inner.
+
+    Bits of `collisions`: 1 shell, 2 motor housing, 4 thigh, 8 knee, 16 shank touches the ground; 32 legs touch each
+    other, 64 links of one leg, 128 leg and shell.
+    """
 
     world: int  # index of the world
     pos: wp.vec3  # [m] base origin, world
@@ -35,7 +39,7 @@ class RobotView:
     clipped: float  # [rad^2] sum over motors of the squared change of the target by the command filter
     default_angle: vec12  # [rad] motor angles of the default pose
     contacts: int  # number of paws on the ground
-    collisions: int  # bits of `jumper_warp.kernels.collision.robot`
+    collisions: int  # bits, see above
     contact: wp.vec4  # [1] 1: the paw is on the ground
     first_contact: wp.vec4  # [1] 1: it touched down in this step
     air_time: wp.vec4  # [s] since the paw left the ground; at its first contact the length of its swing, later 0
@@ -53,6 +57,8 @@ class RobotArrays:
     """State of all robots, in Python `env.robot`; the `prev_` arrays hold the values of the previous policy step.
 
     NumPy appends an axis for vectors: `env.robot.paw_pos.numpy()` has shape (4, num_worlds, 3), a `RobotView` (4, 3).
+    `joint_q` has 43 numbers a world: position and quaternion of the base, five angles a leg (lateral, outer, outer
+    knee, inner, inner knee), and a quaternion of each ankle's loop joint. `joint_qd` has 38, three for a quaternion.
     """
 
     joint_q: wp.array(dtype=float)  # (COORDS num_worlds,) base position [m], quaternion (xyzw), joint angles [rad]

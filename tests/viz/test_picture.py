@@ -97,6 +97,8 @@ def test_hops_in_place_show_the_first_and_then_apexes_over_time_without_their_pa
     assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
     axis, *_ = (line.points for line in picture._lines(scene))
     assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, Z] == pytest.approx(scene.lowest)
+    assert all(len(line.points) == 2 for line in picture._lines(scene))  # no arrow: moments are not to scale
+    assert "time, not\nto scale" in [label.text for label in picture._labels(scene)]
     times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
     assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
     assert all(label.point[Z] < scene.lowest for label in times)
