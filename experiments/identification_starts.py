@@ -82,10 +82,15 @@ def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
         "accepted_bad_expected": sum(fit["bad_probability"] for fit in accepted),
         "worst_accepted": max((fit["worst"] for fit in accepted), default=0.0),
         "accepted_bad_fits": [
-            {name: fit[name] for name in ("robot", "noise", "outside", "identified", "worst", "mass_error_std")}
+            f"robot {fit['robot']}, noise {fit['noise']}: {fit['outside']} of {fit['identified']} outside, worst "
+            f"{fit['worst']:.1f} sigma, scale {fit['mass_error_std']:+.1f} sigma"
             for fit in bad
         ],
-        "rejected_fits": [[fit["robot"], fit["noise"], fit["inconsistency"]] for fit in fits if not fit["consistent"]],
+        "rejected_fits": [
+            f"robot {fit['robot']}, noise {fit['noise']}: {fit['inconsistency']}"
+            for fit in fits
+            if not fit["consistent"]
+        ],
         "three_starts": sum(len(fit["starts"]) > 2 for fit in fits),
         "cpu_s_median": float(np.median(cpu)), "cpu_s_mean": float(np.mean(cpu)), "cpu_s_largest": max(cpu),
     }  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 from experiments.identification_starts import Args, saved_fits, summary
 from experiments.support.far_robots import bad_probability
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values, write_metrics
 
 
 def fit_line(robot, consistent, good):
@@ -19,12 +20,15 @@ def fit_line(robot, consistent, good):
     return names | numbers | {"starts": [[0.0, 0.0], [1.0, 0.5]]}
 
 
-def test_summary_counts_bad_accepted_and_good_rejected_fits():
+def test_summary_counts_bad_accepted_and_good_rejected_fits(tmp_path):
     cases = ((True, True), (True, True), (True, False), (False, True), (False, False))
     values = summary([fit_line(i, *case) for i, case in enumerate(cases)])
-    assert values["accepted"] == 3 and values["accepted_bad"] == 1 and values["accepted_bad_fits"][0]["robot"] == 2
+    assert values["accepted"] == 3 and values["accepted_bad"] == 1
+    assert len(values["accepted_bad_fits"]) == 1 and values["accepted_bad_fits"][0].startswith("robot 2, noise 0: 2 of")
     assert values["accepted_bad_expected"] == pytest.approx(0.12)
     assert values["good"] == 3 and values["good_rejected_rate"] == pytest.approx(1 / 3)
+    write_metrics(tmp_path, values)
+    assert len(read_values(tmp_path)["rejected_fits"]) == 2
 
 
 def test_errors_common_to_all_parameters_make_a_fit_bad_as_often_as_one_parameter():
