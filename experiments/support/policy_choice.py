@@ -80,7 +80,8 @@ def _success(row: Row | None, kind: str) -> str:
     if row is None:
         return ""
     if "speed_m_s" in row.values:
-        worst = max(metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate"))
+        rates = (metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate"))
+        worst = max(rate for rate in rates if isinstance(rate, float))
         return f"{number('fall_rate', worst)} fall".replace(" ", "\N{NO-BREAK SPACE}")
     rate, (key, factor, text) = RATES.get(kind, "success_rate"), ERRORS[kind]
     value = row.metrics[key].value
