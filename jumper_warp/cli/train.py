@@ -65,7 +65,7 @@ class TrainArgs:
     """Robot overlay, a file that `jumper sysid fit` writes. Robots are sampled around its values. Its randomisation
     ranges override the task's; flags override both."""
     preset: str | None = None
-    """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 15
+    """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""
     overlay: Annotated[Any, tyro.conf.Suppress] = None  # Overlay of --robot or the resumed run, with flags' ranges
     checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
