@@ -62,8 +62,8 @@ class TrainArgs:
     observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
     without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, a file that `jumper sysid fit` writes. Robots are sampled around its values. Its randomisation
-    ranges override the task's; flags override both."""
+    """Robot overlay, written by `jumper sysid fit`. Robots are sampled around its values. Its randomisation ranges
+    override the task's; flags override both."""
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""
