@@ -59,15 +59,19 @@ def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, goals: np.n
     return jumps
 
 
+def places_ahead(limits: tuple[float, float], count: int) -> np.ndarray:
+    """Return evenly spaced goals straight ahead [m], (count, 1, 2); limits [m]: nearest and farthest distance."""
+    return np.stack([np.linspace(*limits, count), np.zeros(count)], axis=1)[:, None]
+
+
 def success_rate(trainer: Ppo | Shac, eval_env: Env, limits: tuple[float, float] | None = None) -> float:
     """Return the success rate [1] of jumps to evenly spaced heights, or places ahead, one per world of `eval_env`.
 
     limits [m]: lowest and highest height or distance; None: those of TEST_RANGES.
     """
     suite, count = eval_env.task.evaluation_suite, eval_env.num_envs
-    goals = np.linspace(*(limits or TEST_RANGES[suite]), count)
-    if suite == "landing_position":
-        goals = np.stack([goals, np.zeros(count)], axis=1)[:, None]
+    limits = limits or TEST_RANGES[suite]
+    goals = places_ahead(limits, count) if suite == "landing_position" else np.linspace(*limits, count)
     return float(run_jumps(trainer.model.act, eval_env, goals).success.mean())
 
 

@@ -25,6 +25,7 @@ from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.runner import train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.metrics import Metrics, measure
+from support.learning import places_ahead
 
 FULL, ARMS = "full", ("full", "no_initialisation", "no_estimates", "no_curriculum")
 """Arms: the recipe, and without reference state initialisation, projectile estimates or curriculum."""
@@ -86,7 +87,7 @@ def goals_of_test(test: str, num_jumps: int) -> np.ndarray:
     """Return the goals ahead and to the left [m], (jumps, 1, 2), of the tests `straight` and `grid`."""
     if test == "grid":
         return Grid().goals
-    return np.stack([np.linspace(*DISTANCES, num_jumps), np.zeros(num_jumps)], axis=1)[:, None]
+    return places_ahead(DISTANCES, num_jumps)
 
 
 def make_log(task: TaskCfg, test: str, num_jumps: int) -> EvaluationLog:
