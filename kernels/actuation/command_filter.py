@@ -108,7 +108,7 @@ def command_filter_kernel(
     # out
     filtered_target: wp.array2d(dtype=real),
 ):
-    """Write the filtered motor targets of every leg; launch over (4, number of worlds), worlds from `first` on.
+    """Write every leg's motor targets after the command filter; launch over (4, worlds), from world `first` on.
 
     raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds. offset [rad],
     (12, num_worlds): reading minus true angle of each position sensor; the filter uses the reading.

@@ -30,7 +30,7 @@ def paw_force_kernel(
     peak_force: wp.array(dtype=float),
     peak_paw_force: wp.array2d(dtype=float),
 ):
-    """Copy the paws' contact forces [N] to shape (4, num_worlds) and update the peaks; one thread per world.
+    """Copy the paws' contact forces [N] to shape (4, num_worlds) and update their largest values; one thread per world.
 
     total_force (4 num_worlds,): a contact sensor's, paws FL, FR, BL, BR of each world. peak_paw_force (4, num_worlds)
     is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 discards earlier peaks.

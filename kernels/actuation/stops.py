@@ -47,7 +47,7 @@ class StopParams:
 
 @wp.struct
 class StopRates:
-    """Motor rates beyond which a leg's hard stops press in a step; rows are lateral, outer, inner, outer + inner."""
+    """End-of-step motor rates beyond which hard stops exert torque; entries: lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
     upper: vec4  # [rad/s] rate at the end of the step below which the upper stop is free
@@ -67,7 +67,7 @@ class StopForces:
 
 @wp.func
 def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
-    """Return the motor rates beyond which a leg's hard stops press in a step dt [s] from angles [rad] of its motors."""
+    """Return the end-of-step motor rates beyond which hard stops exert torque in a step dt [s], from angles [rad]."""
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
     outside = real(1.0) / dt
@@ -105,7 +105,7 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return which stop of row i (a motor or their sum) is pressed in the set: 0 (none), LOWER_STOP or UPPER_STOP."""
+    """Return which stop of angle i (lateral, outer, inner, sum) the set holds: 0 (none), LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
@@ -130,7 +130,7 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the set of hard stops to solve a leg's step with next, after `sets` other sets were tried.
+    """Return the set of pressed hard stops with which to solve a leg's step next, after `sets` sets were tried.
 
     The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s].
     """
@@ -152,7 +152,7 @@ def one_by_one(sets: int) -> bool:
 
 @wp.func
 def change_one(pressed: int, required: int) -> int:
-    """Return the set of hard stops `pressed`, changed toward the set `required` in the first row that differs."""
+    """Return the set `pressed` of hard stops, made equal to `required` at the first angle where they differ."""
     for i in range(ROWS):
         bits = ROW_MASK << (ROW_BITS * i)
         if (pressed ^ required) & bits != 0:
@@ -162,7 +162,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of the hard stop of row i (a motor or their sum) at a rate [rad/s]; 0 if not pressed."""
+    """Return the torque [N m] of angle i's stop (lateral, outer, inner, sum) at a rate [rad/s]; 0 if not pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)

@@ -1,4 +1,4 @@
-"""Attitude commands: sampled, or set from outside."""
+"""Commands of the attitude task (goal orientations): sampled, or set by the host program."""
 
 import warp as wp
 
@@ -49,7 +49,7 @@ def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
 
 @wp.func
 def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
-    """Return the sampled rotation (xyzw) to a goal orientation: axis of the body, angle from `ranges.angle`."""
+    """Return a sampled rotation (xyzw) to a goal orientation: axis in body axes, angle from `ranges.angle`."""
     axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.body_axis_probability)
     return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 

@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base state of a sampling attempt: that of `start`, in the last attempt with legs in the default pose.
+    """Return the base state of a sampling attempt: `start`, but in the last attempt with the default leg pose.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """
@@ -57,7 +57,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return the motor state of leg `leg`, at rest in the default pose or a sampled one; reachable if within limits."""
+    """Return default or sampled motor angles of leg `leg`, at rest; reachable if outer + inner is within its limits."""
     sample = LegSample()
     if base.default_legs:
         for j in range(3):

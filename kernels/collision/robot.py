@@ -155,7 +155,7 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
 
 @wp.func
 def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] of a leg from the shell without the drums at the leg's end, at most `bound` (>= 0)."""
+    """Return the distance [m] of a leg from the shell without the motor drums at its end, at most `bound` (>= 0)."""
     drums = wp.where(capsules.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))

@@ -118,7 +118,7 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
 
 @wp.func
 def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the next iterate of a sliding paw's impulse [N s], by a friction step that is cut off at the cone.
+    """Return the next iterate of a sliding paw's impulse [N s]: a friction update, clamped to the friction cone.
 
     The impulse satisfies the normal condition of the contact. impulse [N s], velocity [m/s]: current values at the paw.
     The new friction is (current friction - slip / scale), cut off at the friction cone. The fixed point is the cone's
@@ -186,7 +186,7 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Change a paw's contact into one with the sliding block, which also moves under the paw's impulse.
+    """Return a paw's contact with the sliding block, which also moves under the paw's impulse.
 
     `on_block` is 1, and `total` includes the response.
     """

@@ -1,4 +1,4 @@
-"""Inputs of a launch of the dynamics (targets, forces), and the arrays of results of every world."""
+"""Inputs of the physics kernels (motor targets, forces), and arrays of their results in every world."""
 
 import warp as wp
 
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Drive:
-    """Inputs that drive the robots in a launch: motor targets, joint forces and a wrench on the base, all constant."""
+    """Inputs that drive the robots, constant in a kernel launch: motor targets, joint forces, wrench on the base."""
 
     closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
     motors: MotorArrays
@@ -27,7 +27,7 @@ class Drive:
 
 @wp.struct
 class LegDrive:
-    """Inputs that drive one leg in a launch: targets, motor constants and added torques (lateral, outer, inner)."""
+    """Inputs that drive one leg in a kernel launch: targets, motor constants, added torques (lateral, outer, inner)."""
 
     closed_loop: int  # as in `Drive`
     lateral: MotorParams

@@ -1,6 +1,7 @@
-"""Per-world parameters of the robot: the table of `layout`, (PARAMETER_ROWS, num_worlds), read and packed from Newton.
+"""Robot parameters of all worlds in a table: functions that read it, and kernels that fill it from Newton's model.
 
-`load_*` return structs for leg 0 to 3 (FL, FR, BL, BR) of a world; units are those of the structs.
+The table is (PARAMETER_ROWS, num_worlds), see `layout`. `load_*` return structs for leg 0 to 3 (FL, FR, BL, BR) of a
+world; units are those of the structs.
 """
 
 import warp as wp
@@ -229,7 +230,7 @@ def repack_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Update the parameter table by what domain randomisation changed, where mask (num_worlds,) is not 0.
+    """Copy the parameters that domain randomisation changes to the parameter table, where mask (num_worlds,) is not 0.
 
     Launch over (worlds from `first` on, 25): threads 0 to 20 of a world write the mass moments of a body each, the
     other four a leg's armature, friction torques and paw friction. Inputs as in the pack kernels.

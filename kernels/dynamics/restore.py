@@ -119,7 +119,7 @@ def rest_blocks_kernel(
     # in, out
     ground: Ground,
 ):
-    """Move the blocks of masked worlds to their start positions with zero velocity; one thread per world."""
+    """Move the sliding blocks of masked worlds to their start positions with zero velocity; one thread per world."""
     world = wp.tid()
     if mask[world]:
         rest_block(ground, world)

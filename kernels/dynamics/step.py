@@ -1,4 +1,4 @@
-"""Parts of a physics step that `advance` and `advance_legs` share: a leg's terms, a paw's contact, the base.
+"""Parts of a physics step that CPU (`advance`) and GPU (`advance_legs`) share: equations of leg and base, contact.
 
 Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
 its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RobotModel:
-    """Parameters of the robots and their ground in every world; constant during a launch, blocks aside."""
+    """Parameters of the robots and their ground in every world; constant during a launch but for sliding blocks."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4,): FL, FR, BL, BR, the same in all worlds
     table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
@@ -86,7 +86,7 @@ def leg_terms(
     params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return what a leg contributes to a step's equations of motion: dynamics, eliminated motors, paw kinematics.
+    """Return a leg's contribution to a step's equations of motion: dynamics, eliminated motors, paw kinematics.
 
     In body axes; passive forces and pressed stops are included. angles [rad], rates [rad/s], torque [N m] of the
     motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: of the base, body axes.
@@ -154,7 +154,7 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
 
 @wp.func
 def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
-    """Return which table row holds paw k's friction coefficient: static if it stuck before the step, else dynamic.
+    """Return the parameter-table row of paw k's friction coefficient: static if it stuck before the step, else dynamic.
 
     velocity [m/s]: of the contact point relative to the ground at the start of the step; impulse [N s]: in the
     preceding step; normal: unit; all in the same axes.
@@ -217,7 +217,7 @@ def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: 
 
 @wp.func
 def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return the inverse of the base's equations of motion; zero, so that it cannot accelerate, if the base is held."""
+    """Return `inverse`, or zeros if the world's base is held (suspended), so that it cannot accelerate."""
     if model.held.shape[0] > 0:
         if model.held[world] != 0:
             return BaseInverse()

@@ -155,7 +155,7 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Weights of the two delayed policy targets between which a motor's target lies in a physics step."""
+    """Indices and weight of the two delayed policy targets between which a motor's target is interpolated."""
 
     older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # policy step of the target at the end of the physics step
@@ -164,7 +164,7 @@ class Arrival:
 
 @wp.func
 def arrival(step: int, substeps: int, delay: real) -> Arrival:
-    """Return the delayed policy targets, and their weights, between which a motor's target lies in physics step `step`.
+    """Return the indices and weight of the two delayed policy targets between which physics step `step` interpolates.
 
     step counts from 0. delay: latency in physics steps, a real >= 0. substeps: physics steps per policy step. A target
     that arrives exactly at the start of the step has weight 1, and the one-sided derivative toward a larger latency. No
@@ -195,7 +195,7 @@ def policy_target(
 def arrived_target(
     commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
 ) -> real:
-    """Return the delayed target [rad] that motor 0 to 11 follows in a physics step, interpolated as `arrived` says."""
+    """Return the delayed target [rad] that motor 0 to 11 follows in a physics step, interpolated by `arrived`."""
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer

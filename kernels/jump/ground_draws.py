@@ -16,7 +16,7 @@ DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] |x|, |y| of a paw from 
 
 @wp.struct
 class GroundRanges:
-    """Probabilities of a platform and of a block in standing starts, and their ranges; pairs are (lower, upper)."""
+    """Probabilities and ranges (lower, upper) of a platform to jump off and a block to jump onto in standing starts."""
 
     platform: float  # probability of a platform under the start
     block: float  # probability of a block under the goal

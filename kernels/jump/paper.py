@@ -109,7 +109,7 @@ def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float
 
 @wp.func
 def predicted_height_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float) -> bool:
-    """Terminate `steps` policy steps after takeoff if the ballistic apex is more than `tolerance` [m] off the goal."""
+    """Terminate `steps` policy steps after takeoff if the ballistic apex is > `tolerance` [m] off the commanded one."""
     if state.phase != FLIGHT or state.phase_steps != int(steps) or state.apex_passed != 0:
         return False
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)

@@ -104,7 +104,7 @@ def begin_jump(
     rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
     next_jump_probability: float,
 ) -> JumpState:  # fmt: skip
-    """Return the task state of a new episode, with the phase and the command step of its start mode.
+    """Return the task state of a new episode, whose jump phase and command step depend on its start mode.
 
     goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base.
     """
@@ -222,7 +222,7 @@ def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpL
 
 @wp.func
 def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
-    """Return the state with a jump commanded from outside if the robot is at the start or has landed; else `state`.
+    """Return the state with a jump commanded by the host if the robot is at the start or has landed; else `state`.
 
     values: goal x, y [m] relative to base and heading [rad], base height at the apex [m], and, at the start only, the
     policy step of the command.

@@ -98,7 +98,7 @@ class JumpBase:
 
 @wp.func
 def start_mode_at(probability: vec_start_modes, u: float) -> int:
-    """Return the start mode that a random number u, uniform in [0, 1), selects.
+    """Return the start mode (STANDING, IN_FLIGHT, ...) that a random number u, uniform in [0, 1), selects.
 
     Mode i has the probability `probability[i]`.
     """
@@ -293,7 +293,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return sampled motor angles of leg `leg` in flight, at rest; reachable if its paw is 0.01 m above the ground.
+    """Return sampled motor angles of leg `leg` in flight, at rest; reachable if its paw is >= 0.01 m above ground.
 
     Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
     """

@@ -56,7 +56,7 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 
 @wp.func
 def sync_attempts(rng: RngStream):
-    """Synchronise the threads of a world between two attempts to sample it; no effect with one thread per world."""
+    """Synchronise the threads that sample a world's start state; no effect with one thread per world."""
     if rng.lanes > 1:
         sync_lanes()
 

@@ -1,4 +1,4 @@
-"""Handover of a world from one skill to another; the robot's state does not change."""
+"""Handover of a world from one skill (task) to another; the robot's state does not change."""
 
 from typing import Any
 
@@ -59,7 +59,7 @@ def restore_task_kernel(
     parameters: RobotParameters,
     episode: EpisodeArrays,
 ):
-    """Reset worlds with mask != 0 to their first skill and its motors, without a request; one thread per world.
+    """Make the first skill of worlds with mask != 0 active: set motor constants, clear requests; one thread per world.
 
     home: (num_worlds,) index of each world's first skill.
     """
@@ -94,7 +94,7 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
-        """Hand over worlds from skill `source` to `target` where `when` holds; one thread per world.
+        """Hand over worlds from skill `source` to `target` where `handover.when` holds; one thread per world.
 
         A pending command of the target is set. moved: (num_worlds,) 1 where a world was handed over in this step; these
         worlds and ended ones keep their skill. sources, targets: (num_worlds,) task states of both skills.

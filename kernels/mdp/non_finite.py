@@ -1,4 +1,4 @@
-"""Record of the first non-finite value of each term, with the state of its world; nothing is written without one."""
+"""Record of the first non-finite value of each term of a task (reward, observation, ...), with its world's state."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ NO_WORLD = wp.constant(-1)  # `NonFinite.world` of a term that was always finite
 
 @wp.struct
 class NonFinite:
-    """First non-finite value of each term of a task, by slice of worlds; arrays of (slices * terms, ...).
+    """First non-finite value of each term of a task in each slice (range) of worlds; arrays of (slices * terms, ...).
 
     Terms: the rewards, the curriculum, the diverged state, then the observations of all groups. Slices have records of
     their own, since threads of a CPU, which advance them together, have no atomic operations.

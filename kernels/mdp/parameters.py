@@ -75,27 +75,27 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
 
 @wp.func
 def base_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Add a mass from lower to upper [kg] to the base, and scale its inertia in proportion."""
+    """Add a random mass from lower to upper [kg] to the base, and scale its inertia in proportion."""
     write_mass(robot, rng.world, 0, 1.0 + uniform(rng, 0, lower, upper) / robot.nominal_mass[0])
 
 
 @wp.func
 def link_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Scale mass and inertia of each leg link by a factor from lower to upper [1]."""
+    """Scale mass and inertia of each leg link by a random factor from lower to upper [1]."""
     for body in range(1 + rng.lane, BODIES, rng.lanes):
         write_mass(robot, rng.world, body, uniform(rng, body, lower, upper))
 
 
 @wp.func
 def com_shift(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Shift the base's centre of mass along each body axis by a distance from lower to upper [m]."""
+    """Shift the base's centre of mass along each body axis by a random distance from lower to upper [m]."""
     shift = wp.vec3(uniform(rng, 0, lower, upper), uniform(rng, 1, lower, upper), uniform(rng, 2, lower, upper))
     robot.body_com[rng.world * BODIES] = robot.nominal_com[0] + shift
 
 
 @wp.func
 def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Scale each motor's armature by a factor from lower to upper [1]."""
+    """Scale each motor's armature by a random factor from lower to upper [1]."""
     for m in range(rng.lane, 12, rng.lanes):
         dof = 6 + motor_slot(m)
         robot.joint_armature[rng.world * DOFS + dof] = robot.nominal_armature[dof] * uniform(rng, m, lower, upper)
@@ -103,7 +103,7 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Set the Coulomb friction of each motor to a value from lower to upper [N m], plus `motor_friction_move`."""
+    """Sample the Coulomb friction of each motor from lower to upper [N m], plus `motor_friction_move`."""
     for m in range(rng.lane, 12, rng.lanes):
         value = moved_uniform(rng, m, lower, upper, robot.motor_friction_move[m])
         robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = value
@@ -160,7 +160,7 @@ def motors_kernel(
 def gains(
     robot: RobotParameters, rng: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
 ):  # fmt: skip
-    """Scale kp and kd of each motor by factors [1] from the two ranges."""
+    """Scale kp and kd of each motor by random factors [1] from the two ranges."""
     for m in range(rng.lane, 12, rng.lanes):
         ratio = wp.vec2(uniform(rng, m, kp_lower, kp_upper), uniform(rng, 12 + m, kd_lower, kd_upper))
         robot.gain_ratio[m, rng.world] = ratio
@@ -172,7 +172,7 @@ def speed_limits(
     robot: RobotParameters, rng: RngStream, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
     cutoff_upper: float,
 ):  # fmt: skip
-    """Scale no-load and cutoff speed of each motor by factors [1]; the cutoff stays below the no-load speed."""
+    """Scale no-load and cutoff speed of each motor by random factors [1]; the cutoff stays below the no-load speed."""
     for m in range(rng.lane, 12, rng.lanes):
         ratio = wp.vec2(uniform(rng, m, no_load_lower, no_load_upper), uniform(rng, 12 + m, cutoff_lower, cutoff_upper))
         robot.speed_ratio[m, rng.world] = ratio
@@ -181,7 +181,7 @@ def speed_limits(
 
 @wp.func
 def joint_offset(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Add a constant error from lower to upper [rad] to the nominal one of each motor's position sensor."""
+    """Set each motor's position sensor error to its nominal value plus a random one from lower to upper [rad]."""
     for m in range(rng.lane, 12, rng.lanes):
         robot.motors.offset[m, rng.world] = robot.nominal_offset[m] + uniform(rng, m, lower, upper)
 

@@ -1,4 +1,4 @@
-"""Parts of start states that tasks share: legs from foot positions, sampled foot positions, orientations.
+"""Helpers of all tasks to sample start states: legs from foot positions, foot positions, orientations.
 
 A foot position is the ankle (the paw's centre) unless stated otherwise.
 """
@@ -21,7 +21,7 @@ PAW_X, PAW_Y = 20, 24  # Indices in the stream of an attempt, each the first of 
 
 @wp.struct
 class LegSample:
-    """Sampled motor angles and rates of one leg, and whether it can reach them."""
+    """Sampled motor angles and rates of one leg, and whether the sample is valid."""
 
     angles: wp.vec3  # [rad] of the lateral, outer and inner motor
     rates: wp.vec3  # [rad/s]
@@ -43,7 +43,7 @@ def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
 
 @wp.func
 def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
-    """Return a leg with motor rates that move its ankle at `ankle_vel` [m/s] relative to the base (body axes)."""
+    """Return `leg` with motor rates that move its ankle at `ankle_vel` [m/s] relative to the base (body axes)."""
     sample = leg
     sample.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
     sample.reachable = leg.reachable and wp.length(sample.rates) <= MAX_LEG_SPEED

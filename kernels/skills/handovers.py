@@ -96,7 +96,7 @@ def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> boo
 
 @wp.func
 def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
-    """Return whether the jump takes over from turning in its flight again: at contact, or shortly before landing."""
+    """Return whether the jump takes over again from turning in its flight: at contact, or shortly before landing."""
     if robot.contacts > 0:
         return True
     if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:

@@ -1,4 +1,4 @@
-"""Ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
+"""Ground under the paws: a plane z = 0 or a heightfield, and optionally a sliding block in each world.
 
 Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
 """

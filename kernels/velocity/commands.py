@@ -1,4 +1,4 @@
-"""Velocity commands: sampled at resets and within episodes, or set from outside."""
+"""Velocity commands: sampled at resets and within episodes, or set by the host program."""
 
 import warp as wp
 
@@ -107,7 +107,7 @@ def resample_velocity(
 def set_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
-    """Return the state with a velocity commanded from outside, which holds until the next command.
+    """Return the state with a velocity commanded by the host, which holds until the next command.
 
     values: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes; gait frequency [Hz], 0: unchanged. The other
     arguments are unused.

@@ -94,7 +94,7 @@ def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
 
 @wp.func
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
-    """Return the base's sampled pose and velocity around `start.spot`; vertical velocities have 0.3 of the range.
+    """Return the base's sampled pose and velocity around `start.spot`; vertical velocity has 0.3 of the range.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`.
     """

@@ -1,4 +1,4 @@
-"""Gradients of the virtual power of a step (`leg_action`, `base_action`), for CPU and GPU kernels.
+"""Gradients of a physics step, for CPU and GPU kernels: derivatives of its virtual power (see `virtual_power`).
 
 A gradient w.r.t. x has the axes and the order of x.
 """
@@ -59,9 +59,9 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the base's adjoint multipliers, accelerations and end velocities, held constant in its virtual power.
+    """Return the constants for differentiating the base's virtual power: multipliers, accelerations, end velocities.
 
-    The step takes dt [s], from state `base` to `end`. virtual_*: multipliers, body axes.
+    The step takes dt [s], from state `base` to `end`. virtual_*: adjoint multipliers, body axes.
     """
     factors = BaseFactors()
     factors.virtual_lin = virtual_lin
@@ -78,7 +78,7 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's adjoint multipliers, motor motion and contact impulse, held constant in its virtual power.
+    """Return the constants for differentiating a leg's virtual power: multipliers, motor motion, contact impulse.
 
     rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s].
     """

@@ -80,7 +80,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Split the gradient w.r.t. a motor's interpolated target between the two policy targets around it, and add it."""
+    """Add the gradient w.r.t. a motor's interpolated target, split by weight, to those of the two policy targets."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)

@@ -1,4 +1,4 @@
-"""Kernels for GPUs that add the gradient of a rollout w.r.t. constants of legs and motors, all steps in parallel.
+"""GPU kernels that add a rollout's gradient of the loss w.r.t. leg and motor constants, all steps in parallel.
 
 They read the multipliers that `reverse_legs_kernel` has recorded.
 """
@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """Indices of a physics step in a rollout and in its record, and its weight in the sums of its thread."""
+    """Physics step that a GPU thread differentiates: index in the rollout, entry in the record, weight in the sum."""
 
     step: int  # of the rollout
     entry: int  # of the record
@@ -31,13 +31,13 @@ class SpanStep:
 
 @wp.func
 def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
-    """Return how many physics steps of a span of trajectory rows each of a leg's `threads_per_leg` threads takes."""
+    """Return how many physics steps each of a leg's `threads_per_leg` threads takes for a range of trajectory rows."""
     return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 
 @wp.func
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
-    """Return physics step k (from 0) of a span of trajectory rows, or the last one with weight 0 if k is beyond."""
+    """Return physics step k (from 0) of a range of trajectory rows; beyond the range, the last step with weight 0."""
     step = SpanStep()
     end = span.end * timing.every
     step.step = span.begin * timing.every + k
@@ -62,7 +62,7 @@ def leg_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradient of the loss w.r.t. constants of the legs, summed over the physics steps of a span of rows.
+    """Add the gradient of the loss w.r.t. constants of the legs, summed over the steps of a range of trajectory rows.
 
     Launch over (worlds, threads_per_leg, 4). threads_per_leg: threads that divide the steps of a leg, 8 on a GPU (a
     warp per world) and 1 on a CPU. Worlds count from `settings.first`.
@@ -103,7 +103,7 @@ def motor_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradient of the loss w.r.t. constants of the motors, summed over the physics steps of a span of rows.
+    """Add the gradient of the loss w.r.t. constants of the motors, summed over the steps of a range of trajectory rows.
 
     Launch as `leg_constants_kernel`. The kernels are separate, because one would need more memory per thread than a
     GPU's L1 cache holds.

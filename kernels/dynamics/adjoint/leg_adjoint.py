@@ -213,7 +213,7 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return the base's adjoint multipliers and motion in a recorded step, held constant in its virtual power.
+    """Return the constants for differentiating the base's virtual power in a recorded step: multipliers and motion.
 
     i: entry of the step, of dt [s], in the record; base: state at its start.
     """
@@ -225,7 +225,7 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's adjoint multipliers, motion and contact impulse in a recorded step, constant in its virtual power.
+    """Return the constants for differentiating a leg's virtual power in a recorded step: multipliers, motion, contact.
 
     step: its number in the rollout; dt [s]; i: its entry in the record.
     """
@@ -301,7 +301,7 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Run one time step backwards with a thread per leg: return the gradient w.r.t. the state at its start.
+    """Backpropagate through one time step, a thread per leg: return the gradient of the loss w.r.t. its start state.
 
     adj: gradient w.r.t. the state at the end. See `reverse_step`. i: the step's entry in the record, step: its number
     in the rollout. force [N], moment [N m]: on the base at its com, world axes. writes_record: whether this thread

@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepRecord:
-    """Record of the physics steps between two rows of a rollout, recomputed for the reverse pass."""
+    """Record of the physics steps between two trajectory rows of a rollout, recomputed for the reverse pass."""
 
     base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
     angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
@@ -318,7 +318,7 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the base's adjoint multipliers and motion in the recomputed step `at`, held constant in its virtual power.
+    """Return the constants for differentiating the base's virtual power in the step `at`: multipliers and motion.
 
     m: from `find_multipliers`.
     """
@@ -331,7 +331,7 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's adjoint multipliers, motion and impulse in a recomputed step, held constant in its virtual power.
+    """Return the constants for differentiating a leg's virtual power in the step `at`: multipliers, motion, impulse.
 
     k: leg 0 to 3. Needs the results of `find_multipliers`.
     """

@@ -159,7 +159,7 @@ def load_parts(
 
 @wp.func
 def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
-    """Return time step, world and base wrench to recompute the physics steps of policy step t; all else is 0."""
+    """Return a `ReplayedStep` with the time step, world and base wrench of policy step t; all else is 0."""
     at = ReplayedStep()
     at.dt = dt
     at.world = world

@@ -45,7 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the index in the record of the first step after a trajectory row; a row has `every` + 1 entries."""
+    """Return the record's index of the first physics step after a trajectory row; a row has `every` + 1 entries."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -64,7 +64,7 @@ def replay_legs_kernel(
     # out
     record: LegRecord,
 ):
-    """Recompute and record the physics steps after each trajectory row of a span, with a thread per row and leg.
+    """Recompute and record the physics steps of a range of trajectory rows (`span`), with a thread per row and leg.
 
     Launch over (rows of the span, count rounded up to a multiple of 8, 4). count: number of worlds, from
     `settings.first` on. Threads beyond the last world repeat it and write the same bits.
@@ -109,7 +109,7 @@ def replay_legs_kernel(
 
 @wp.func
 def load_entries(gradients: Gradients, world: int) -> RowCotangent:
-    """Read the gradient w.r.t. the base's state in the trajectory row after a span from `gradients.q` and `qd`."""
+    """Return the gradient w.r.t. the base entries of a trajectory row, read from `gradients.q` and `gradients.qd`."""
     entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
@@ -120,7 +120,7 @@ def load_entries(gradients: Gradients, world: int) -> RowCotangent:
 
 @wp.func
 def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint:
-    """Read the gradient w.r.t. a leg's motor angles and rates in the trajectory row after a span; all else is 0."""
+    """Return the gradient w.r.t. a leg's motor angles and rates, read from `gradients.q` and `qd`; all else is 0."""
     m = 3 * leg
     adj = LegAdjoint()
     adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
@@ -133,7 +133,7 @@ def reverse_motors(
     old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
     world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Add the gradient through a leg's motor torques in a physics step to that w.r.t. its angles and rates (`old`).
+    """Return `old` plus the gradient w.r.t. a leg's angles and rates through its motor torques in a physics step.
 
     slopes: derivatives of the torques. writes: whether this thread adds the gradient w.r.t. the targets to `gradients`.
     """
@@ -167,7 +167,7 @@ def reverse_legs_kernel(
     record: LegRecord,
     gradients: Gradients,
 ):
-    """Run the physics steps of a span of trajectory rows backwards, last step first, with a thread per leg.
+    """Backpropagate through the physics steps of a range of trajectory rows (`span`), with a thread per leg.
 
     Launch over (count rounded up to a multiple of 8, 4). gradients.q and gradients.qd hold the gradient w.r.t. the row
     after the span, and are replaced by that w.r.t. its first row. Adds the gradients w.r.t. the parameters of base,

@@ -59,7 +59,7 @@ def reverse_step(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
     legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
-    """Run one time step of a world backwards: return the gradient w.r.t. the base's state at its start.
+    """Backpropagate through one time step of a world: return the gradient w.r.t. the base's state at its start.
 
     adj: gradient w.r.t. the base's state at the end. legs (4,): gradients w.r.t. `angles` and `rates` at the end are
     replaced by those at the start, `torque` is written, the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t.

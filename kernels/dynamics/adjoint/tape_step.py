@@ -1,4 +1,4 @@
-"""Time step for Warp's tape: one launch solves it, and two more are recorded and run backwards.
+"""Differentiable time step for `wp.Tape`: one launch solves the step, and the tape records two more.
 
     solve_kernel (not recorded) -> power_kernel -> integrate_kernel
 

@@ -297,7 +297,7 @@ def contact_action(
     geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return the part of a step's virtual power that one paw's contact has, for the reverse pass to differentiate.
+    """Return the virtual power of one paw's contact in a step, for the reverse pass to differentiate.
 
     It is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
     orientation (xyzw): of the base, world, at the start of the step dt [s].

@@ -128,7 +128,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 @wp.struct
 class StopAttempt:
-    """Set of hard joint stops with which a leg attempts a step, and the rates beyond which they press."""
+    """Set of hard joint stops assumed pressed in an attempted step of a leg, and rates beyond which stops press."""
 
     stop_rates: StopRates  # zero where no stop is near
     pressed: int
@@ -136,7 +136,7 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the set of hard joint stops with which a leg attempts a step of dt [s] from the state `old`."""
+    """Return the set of hard joint stops to assume pressed in a leg's next attempt at a step of dt [s] from `old`."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -214,7 +214,7 @@ def advance_leg(
     model: RobotModel, settings: StepSettings, drive: Drive, params: LegParams, motors: LegDrive, world: int, leg: int,
     old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
-    """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other joint stops.
+    """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other stops for a retry.
 
     A world that has completed all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
     thread moves its world's block.
