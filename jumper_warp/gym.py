@@ -15,7 +15,7 @@ ADAPTER = ("all_groups", "tensors", "autoreset_mode", "render_mode", "render_siz
 
 
 def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVectorEnv:
-    """Return a vector environment of a task; arguments: of `GymVectorEnv` (those named in `ADAPTER`) and of `Env`.
+    """Return a Gymnasium vector environment of a task; arguments: of `GymVectorEnv` (those in `ADAPTER`) and `Env`.
 
     Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
@@ -24,7 +24,7 @@ def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVector
 
 
 def make_env(task: str, **arguments: Any) -> GymEnv:
-    """Return an environment of a task with one world; arguments: of `GymEnv` and of `Env`.
+    """Return a Gymnasium environment of a task with one robot; arguments: of `GymEnv` and of `Env`.
 
     Raises InputError: an unknown task, or arguments that `Env` or `GymEnv` refuses.
     """

@@ -96,7 +96,7 @@ def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Te
 
 
 def waiting_scale(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the factor on a reward: the constant `waiting_scale` while a jump is due, else 1. Shape (n,)."""
+    """Return the factor (n,) on a reward: the constant `waiting_scale` while a commanded jump has not begun, else 1."""
     return torch.where(ctx.jump_due, const["waiting_scale"], 1.0)
 
 

@@ -253,7 +253,7 @@ class Env(Stages):
 
     @locked
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
-        """Begin an episode with a given command in the default pose and first skill; disables resets until `reset`.
+        """Begin episodes with given commands in the default pose and first task; `step` resets no world until `reset`.
 
         commands: one row a world or one for all, columns as in `jumper_warp.tasks.commands.layout_of`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.

@@ -154,7 +154,7 @@ class TaskRuntime:
         return views
 
     def settings_of_skill(self) -> Any:
-        """Return the task's constants as a kernel struct: action scale, command filter, margins."""
+        """Return the task's constants as a kernel struct: action scale, command filter, collision margins."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
         settings.action_scale = vec12(*(4 * (lateral, transversal, transversal)))

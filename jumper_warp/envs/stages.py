@@ -1,4 +1,4 @@
-"""Stages of a policy step: kernels, their order and their arrays."""
+"""Kernel launches of an environment's policy step and resets, in order, with their arrays."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, i
 
 
 class WorldSlice(NamedTuple):
-    """Contiguous range of worlds that a stage is launched for."""
+    """Contiguous range of worlds for which kernels of a policy step are launched, with its episode arrays."""
 
     first: int
     count: int
@@ -137,7 +137,7 @@ class Stages:
             stage()
 
     def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
-        """Return the stages of a policy step by name, in order; calling one launches its kernels without waiting.
+        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
 
         worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
         """

@@ -51,7 +51,7 @@ class PolicySummary:
 
     @property
     def success(self) -> float | None:
-        """Success rate of the nominal robot in the saved metrics, for walking the rate without a fall, or None."""
+        """Success rate in the first test condition, for walking the rate without a fall; None: not evaluated."""
         rates = [self.metrics[key]["value"] for key in SUCCESSES if key in self.metrics]
         if not rates and "fall_rate" in self.metrics:
             return 1.0 - self.metrics["fall_rate"]["value"]
@@ -64,7 +64,7 @@ class PolicySummary:
 
 
 def find_policy(name: str | Path) -> Path:
-    """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
+    """Return the folder of a policy: the project's policy called `name` (- counts as _), else `name` as a path.
 
     Raises PolicyError: there is no such policy or folder, or it is that of a training without a checkpoint.
     """

@@ -124,7 +124,7 @@ class Conditions:
 
 
 def shared_config(configs: Mapping[str, dict[str, Any]], conditions: Conditions) -> dict[str, Any]:
-    """Return the first configuration with a robot overlay among those of several policies on one robot; {}: none.
+    """Return the configuration whose robot overlay (changed robot values) several policies on one robot use; {}: none.
 
     configs: `Policy.config` by name of the policy. One line on standard error names policies of the described robot
     that get the overlay of another one. The overlay of `conditions` replaces all of these.

@@ -68,9 +68,9 @@ def save_policy(
 
 
 def checked_folder(folder: Path) -> Path:
-    """Check that a path can be a policy's folder, and return it.
+    """Return a path for a policy's folder, after checking that it has no suffix of a file.
 
-    Raises PolicyError: it has the suffix of a file.
+    Raises PolicyError: it has one.
     """
     folder = Path(folder)
     if folder.suffix.lower() in FILE_SUFFIXES:

@@ -28,7 +28,7 @@ class CheckpointError(InputError):
 
 
 class Checkpoint(NamedTuple):
-    """Loaded training checkpoint: its path and contents, and the newer ones that cannot be used."""
+    """Loaded training checkpoint: its path and contents, and the reasons why newer ones cannot be used."""
 
     path: Path
     state: dict[str, Any]  # contents, with at least the keys of REQUIRED
@@ -129,7 +129,7 @@ def newest_name(folder: Path) -> str:
 
 
 def best_checkpoint(folder: Path) -> Path:
-    """Return the path of the checkpoint with the highest score, the last saved of equal ones or if none has a score.
+    """Return the path of the checkpoint with the highest score; on a tie or without scores, the last saved one.
 
     Raises CheckpointError: there is none.
     """

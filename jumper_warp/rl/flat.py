@@ -30,7 +30,7 @@ class Segment(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of entries up to the start of the next parameter, padding included."""
+        """Number of entries that the parameter occupies in the flat vector, padding included."""
         return aligned(math.prod(self.padded_shape), ALIGNMENT)
 
     def padded_view(self, vector: torch.Tensor) -> torch.Tensor:

@@ -146,7 +146,7 @@ class TrainingLog:
             self._expected_rate = 0.0
 
     def move(self, folder: Path) -> None:
-        """Continue the metrics file in another folder, also if it was deleted, without TensorBoard. Raises OSError."""
+        """Copy the metrics file, even a deleted one, to a folder and use the copy; end TensorBoard. Raises OSError."""
         self._file = self._file.move(folder / METRICS_FILE)
         self._events = None
 

@@ -114,7 +114,7 @@ def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the plain network's layers of the symmetric actor that is nearest to given layers, by least squares.
+    """Return the layers, nearest to given ones by least squares, of a symmetric actor as a plain network.
 
     layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, the others set to 0.
     """

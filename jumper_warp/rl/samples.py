@@ -69,7 +69,7 @@ class RowLayout(NamedTuple):
 
     @property
     def widths(self) -> tuple[int, int, int]:
-        """Numbers of columns of actor features, critic features and the rest, each padded to ROW_ALIGNMENT."""
+        """Numbers of columns of actor features, critic features and the rest, each a multiple of ROW_ALIGNMENT."""
         obs, critic_obs = aligned(self.num_obs, ROW_ALIGNMENT), aligned(self.num_critic_obs, ROW_ALIGNMENT)
         return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
 

@@ -1,4 +1,4 @@
-"""Short-horizon actor-critic (SHAC): gradient ascent of short windows of reward, differentiated through the physics.
+"""Short-horizon actor-critic (SHAC): gradient ascent on the return of short windows, through differentiable physics.
 
 A window has H policy steps of all worlds, with the policy's noise reparametrised. The actor's loss is minus the mean
 over worlds of sum_t g^t r_t + g^H V(s_H), differentiated through rewards, physics and policy. V is a target critic,

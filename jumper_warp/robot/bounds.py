@@ -1,4 +1,4 @@
-"""Plausibility checks of a robot description, which reveal wrong units; robots may be large enough for a person."""
+"""Plausibility checks of a robot description, which reveal wrong units; bounds allow robots that carry a person."""
 
 from __future__ import annotations
 

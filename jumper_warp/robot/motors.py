@@ -59,7 +59,7 @@ class MotorKindCfg:
 
 @dataclass(frozen=True)
 class MotorCfg:
-    """Settings of the robot's twelve motors: gains and limits of both kinds, and over-speed protection."""
+    """Settings of the robot's motors: gains and limits of lateral and transversal motors, and over-speed protection."""
 
     lateral: MotorKindCfg
     transversal: MotorKindCfg
@@ -190,13 +190,13 @@ def horizontal_jump_filter() -> FilterCfg:
 
 
 def walking_filter() -> FilterCfg:
-    """Return the motor command filter for walking: no hard zones, lateral limits at the robot's hard stops."""
+    """Return the motor command filter for walking: lateral limits at the hard stops, no zones of full limiting."""
     lateral, transversal = LimitsCfg(-50.0, 110.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 220.0), horizon=5.0 / 60.0)
 
 
 def loose_filter() -> FilterCfg:
-    """Return the motor command filter for the highest jumps: a horizon of two policy steps and no hard zones."""
+    """Return the motor command filter for the highest jumps: horizon of two policy steps, no zones of full limiting."""
     lateral, transversal = LimitsCfg(-15.0, 15.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 

@@ -142,7 +142,7 @@ def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_range(name: str, values: tuple[float, ...], allowed: Range) -> None:
-    """Raise InputError for a value outside its range; name: of the quantity, for the message."""
+    """Raise InputError for a value outside the range `allowed`; name: of the quantity, for the message."""
     low, high, unit = allowed
     hint = " (1: as described)" if allowed is RATIO else ""
     for value in values:

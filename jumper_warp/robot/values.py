@@ -1,4 +1,4 @@
-"""Values of robots that may differ from the description: identified, or set by an overlay."""
+"""Physical constants of robots that may differ from the description: identified, or set by an overlay."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MOTOR_QUANTITIES = (
 
 @dataclass
 class RobotValues:
-    """Masses, joint, motor and spring constants of N robots, (N, columns) each; motors FL, FR, BL, BR.
+    """Masses, joint, motor and spring constants of N robots, (N, columns) each.
 
-    Motors of a leg: lateral, outer, inner.
+    Motors: legs FL, FR, BL, BR, each lateral, outer, inner.
     """
 
     base_mass: np.ndarray  # (N, 1) [kg] Mass of the base link

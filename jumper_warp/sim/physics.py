@@ -79,7 +79,7 @@ class Physics(ABC):
 
     @abstractmethod
     def forget(self, mask: wp.array) -> None:
-        """Clear warm starts, contact history and divergence of worlds whose mask (num_worlds + 1,) bool is set."""
+        """Clear warm starts, contact history and divergence flags of worlds in a mask, (num_worlds + 1,) bool."""
 
     @abstractmethod
     def after_reset(self, mask: wp.array) -> None:
@@ -150,7 +150,7 @@ class JumperPhysics(Physics):
         """Do nothing after a reset, as SolverJumper reads base and motor coordinates alone."""
 
     def forget(self, mask: wp.array) -> None:
-        """Clear contact history and diverged flags of SolverJumper and reset blocks; see `Physics.forget`."""
+        """Clear contact history and divergence flags of masked worlds, and return their blocks to the start."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         if self._sim.block is not None:
             self.solver.reset_blocks(mask)
@@ -242,7 +242,7 @@ class MujocoPhysics(Physics):
         self.write_bodies()
 
     def forget(self, mask: wp.array) -> None:
-        """Clear contact history, and the last step's velocities, which the constraint rows of the loops read."""
+        """Clear the masked worlds' contact history and last velocities, which the loops' constraint rows read."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         for stale in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
             self._launch(zero_worlds_kernel, stale.shape, [mask], [stale])

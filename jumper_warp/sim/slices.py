@@ -30,7 +30,7 @@ class WorldRange(NamedTuple):
 
 
 def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
-    """Return at most `threads` slices of all worlds, of about equal size and at least MIN_WORLDS; else a single one."""
+    """Divide all worlds into at most `threads` slices of about equal size; if several, each has at least MIN_WORLDS."""
     count = max(1, min(threads, num_worlds // MIN_WORLDS))
     begins = [MIN_WORLDS * (num_worlds // MIN_WORLDS * i // count) for i in range(count)]
     return [WorldRange(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]

@@ -306,17 +306,17 @@ class SolverJumper(SolverBase):
 
     @locked
     def block_position(self) -> np.ndarray:
-        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
+        """Return the sliding blocks' centres [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["center"].copy()
 
     @locked
     def block_velocity(self) -> np.ndarray:
-        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises InputError without blocks."""
+        """Return the sliding blocks' velocities [m/s], world frame, (num_worlds, 2). Raises InputError: no blocks."""
         return self._block_values()["velocity"].copy()
 
     @locked
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
-        """Move the blocks of some worlds (indices), by default all, to new start positions, at rest.
+        """Move the sliding blocks of some worlds (indices), by default all, to new start positions, at rest.
 
         center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks.
         """
@@ -327,7 +327,7 @@ class SolverJumper(SolverBase):
 
     @locked
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
-        """Reset the blocks of some worlds, by default all, to their starts, at rest.
+        """Reset the sliding blocks of some worlds, by default all, to their starts, at rest.
 
         `worlds`: indices, or a mask on the device, bool of shape (num_worlds,) or longer. Raises InputError without
         blocks, or for a shorter mask.

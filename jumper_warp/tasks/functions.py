@@ -53,7 +53,7 @@ def shown_type(kind: Any) -> str:
 def check_function(
     where: str, func: Any, takes: Sequence[Any], returns: str, may_return: Callable[[Any], bool]
 ) -> None:
-    """Raise InputError, with file and line, unless a function takes arguments of types `takes` and returns a valid one.
+    """Raise InputError, with file and line, unless a function takes arguments of types `takes` and its result is valid.
 
     The body is checked of functions from outside the project. where: part of the task, for messages. returns: type of
     the result in words; may_return: whether a type is valid.
@@ -77,7 +77,7 @@ def check_function(
 
 
 def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
-    """Check that a function returns the expected type; raise InputError with its file and line otherwise."""
+    """Raise InputError, with file and line, unless a function takes arguments `takes` and returns `returns` (types)."""
     where = f"{where} {func.key.rsplit('.', 1)[-1]}"
     check_function(where, func, takes, shown_type(returns), lambda kind: SAME.get(kind, kind) is returns)
 

@@ -1,4 +1,4 @@
-"""Randomisation of a robot overlay: the ranges of a task around the overlay's values.
+"""Randomisation ranges of a task for a robot whose values differ from the description (robot overlay).
 
 Each sampled parameter varies around the overlay's value by as much as the task's range varies around the described
 value: factors and additive ranges apply to the overlay's value, and the absolute ranges in `MOVED` are moved by the
@@ -35,7 +35,7 @@ UNITS = {
 
 
 class RangeMoves(NamedTuple):
-    """Differences of a robot overlay's values from the robot description's, in the units of `RandomizationCfg`."""
+    """Differences of a robot overlay's values from the description, by which absolute randomisation ranges move."""
 
     motor_friction: tuple[float, ...] = 12 * (0.0,)  # [N m]
     dynamic_friction: float = 0.0  # [1]
@@ -46,7 +46,7 @@ class RangeMoves(NamedTuple):
 
 
 def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
-    """Return how far an overlay moves randomisation ranges: 0 for quantities that it leaves out, or has ranges for."""
+    """Return how far a robot overlay moves a task's randomisation ranges; 0 where it has no value, or its own range."""
     if overlay is None:
         return RangeMoves()
     described, own, moves = vars(RobotValues.nominal(1)), overlay.randomization, {}
@@ -82,7 +82,7 @@ def with_own_ranges(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
 
 
 def ranges_of(task: TaskCfg, overlay: RobotOverlay | None) -> dict[str, Any]:
-    """Return a task's randomisation ranges [lower, upper] on an overlay, by field and in units of `RandomizationCfg`.
+    """Return a task's randomisation ranges [lower, upper] for a robot overlay, by field and in its unit.
 
     Ranges that are off are left out.
     Motors with different friction have a list of 12 ranges. Errors: as `with_own_ranges`.
@@ -98,7 +98,7 @@ def ranges_of(task: TaskCfg, overlay: RobotOverlay | None) -> dict[str, Any]:
 
 
 def range_words(task: TaskCfg, overlay: RobotOverlay | None, *, changed: bool = False) -> list[str]:
-    """Return a task's randomisation ranges on an overlay as texts, such as "latency 5 to 21 ms".
+    """Return a task's randomisation ranges for a robot overlay as texts, such as "latency 5 to 21 ms".
 
     Where motors differ, a text is over all of them.
     changed: only ranges that the overlay moves or replaces.
@@ -129,9 +129,9 @@ def with_flagged_ranges(
 def with_fixed_ranges(
     overlay: RobotOverlay | None, fixed: Mapping[str, tuple[float, float]], *, nominal: bool
 ) -> RobotOverlay | None:
-    """Return a robot overlay with given randomisation ranges besides its own.
+    """Return a robot overlay with given randomisation ranges, which are added to its own or replace them.
 
-    nominal: in place of them, with its friction of the paws.
+    nominal: drop its own ranges, and fix the friction of the paws at its value.
     fixed: (lower, upper) by field of `RandomizationCfg`.
     """
     if overlay is None:

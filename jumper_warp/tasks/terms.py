@@ -269,7 +269,7 @@ class EventTerm(Term):
             raise InputError(f"EventTerm {self.name}: interval_range_s must be (lower, upper) above 0, got {interval}")
 
     def due_at(self, stage: int) -> bool:
-        """Return whether the event may run at a stage: an int constant `AT_...` of `jumper_warp.kernels.mdp.events`."""
+        """Return whether the event may run at a moment `stage`: STARTUP, AT_RESET, AT_STEP of `kernels.mdp.events`."""
         mode = MODES[self.options["mode"]]
         return stage == mode or (mode == AT_STEP and stage == AT_RESET)
 

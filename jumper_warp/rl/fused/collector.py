@@ -32,7 +32,7 @@ class FusedRollout(NamedTuple):
 
 
 class ObservationWriter:
-    """Writer that normalises observations, stores them as inputs of a network, and sums them for their moments."""
+    """Writer that normalises observations, stores them as a network's inputs, and measures their mean and variance."""
 
     def __init__(self, running: RunningMoments, features: torch.Tensor, num_steps: int) -> None:
         """Allocate sums of observations; running: statistics that normalise; features: (…, num_envs, width)."""

@@ -106,7 +106,10 @@ def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level,
 
 @dataclass(frozen=True)
 class StartProbability:
-    """[1] Probabilities of the start modes of an episode, in the order of the kernels; they add up to 1."""
+    """[1] Probabilities of the states in which an episode starts, such as standing or in flight; they add up to 1.
+
+    The kernels number these states in the order of the fields.
+    """
 
     standing: float = 0.0  # Standing on four paws, from upright to a deep squat
     default: float = 0.0  # In the default pose

@@ -1,4 +1,4 @@
-"""Tasks of jumps on Mars (3.71 m/s^2) as in the authors' sequel, without springs: 24.8 N m, transversal kp 20 N m/rad.
+"""Jumps on Mars (3.71 m/s^2) as in the paper's sequel, without springs; transversal motors: 24.8 N m, kp 20 N m/rad.
 
 The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose filter. Each filter
 has a task. Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to
@@ -26,7 +26,7 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return motors for jumps on Mars: transversal kp and torque limit of the sequel; lateral_torque: limit [N m]."""
+    """Return motors for jumps on Mars, transversal with 24.8 N m and kp 20 N m/rad; lateral_torque: limit [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 
@@ -65,7 +65,7 @@ def vertical_jump_mars() -> TaskCfg:
 
 
 def vertical_jump_mars_loose() -> TaskCfg:
-    """Return the task of a vertical jump on Mars with the loose command filter and goals up to 3.6 m."""
+    """Return the task of a vertical jump on Mars with goals up to 3.6 m and a less restrictive motor command filter."""
     return replace(
         vertical_jump_mars(),
         name="vertical-jump-mars-loose",
@@ -103,5 +103,5 @@ def horizontal_jump_mars() -> TaskCfg:
 
 
 def horizontal_jump_mars_loose() -> TaskCfg:
-    """Return the task of a horizontal jump on Mars with the loose command filter."""
+    """Return the task of a horizontal jump on Mars with a less restrictive motor command filter, `loose_filter`."""
     return replace(horizontal_jump_mars(), name="horizontal-jump-mars-loose", command_filter=loose_filter())

@@ -30,5 +30,5 @@ EPISODE = (
 
 
 def critic(policy: tuple[ObservationTerm, ...], *extra: ObservationTerm) -> tuple[ObservationTerm, ...]:
-    """Return a critic's terms: the policy's without noise and delay, jump progress, randomised parameters, `extra`."""
+    """Return a critic's observation terms: the policy's without noise and delay, jump progress, parameters, `extra`."""
     return (*exact(policy), *EPISODE, *DRAWN, *extra)

@@ -1,4 +1,4 @@
-"""Triton kernels that sum the gradients over all splits of the samples, and take a step of Adam."""
+"""Triton kernels that add up partial sums of the gradients, and take a step of Adam."""
 
 import triton
 import triton.language as tl
@@ -11,7 +11,7 @@ LOG_BETA_2 = tl.constexpr(-0.0010005003335835335)
 
 @triton.jit
 def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr):
-    """Sum gradients over the splits of the samples, in a fixed order, and write the flat gradient (total,).
+    """Add up the gradients of all parts (splits) of the samples in a fixed order; write the flat gradient (total,).
 
     partial: (SPLITS, stride), the gradient of each split.
     table: (3, total) of `FusedLayout`, the entry that a parameter has in `partial`, that of its mirror image, the sign.
@@ -35,9 +35,9 @@ def prepare_step(
     gradient, squares, lr, num_steps, factors, desired_kl, size, actor_size, min_lr, max_lr, ADAPT: tl.constexpr,
     B: tl.constexpr,
 ):  # fmt: skip
-    """Adapt the learning rate for a step of Adam, and write sums of squares of the gradient by block, (blocks, 2).
+    """Adapt the learning rate for a step of Adam, and write the gradient's sum of squares in each block of entries.
 
-    The two columns are actor and critic.
+    squares: (blocks, 2), of actor and critic.
     gradient: (size + 32,), the last entry is the KL divergence. lr, num_steps: () of `FlatAdam`; the rate adapts as in
     `flat.adapted_lr`. factors: (2,) Adam's factors of both moments in this step.
     """

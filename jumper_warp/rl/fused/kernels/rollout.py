@@ -12,7 +12,7 @@ def observe(
     obs, row_stride, col_stride, mean, std, features, moments, rows, num_obs, width, raw_limit, limit,
     BM: tl.constexpr, BN: tl.constexpr,
 ):  # fmt: skip
-    """Write normalised, zero-padded observations, (rows, width), and the sums that their mean and variance need.
+    """Write normalised, zero-padded observations, (rows, width), and sums for mean and variance of the raw ones.
 
     obs: (rows, num_obs) raw, sanitised as `vec_env.sanitise`; mean, std: (num_obs,). moments: (blocks, 2, width) sums
     of the difference from `mean`, and of its square.
