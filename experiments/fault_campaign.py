@@ -59,7 +59,7 @@ def read_trials(folder: Path, seed: int) -> list[dict[str, Any]]:
 
 
 def fault_rows(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each fault: how often it happened, its largest loss, and the trials with it."""
+    """Return a dict for each fault: its count, the most iterations lost to it, and numbers of trials and failures."""
     faults = sorted({fault for trial in trials for fault, _ in trial["faults"]})
     rows = []
     for fault in faults:

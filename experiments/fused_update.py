@@ -1,8 +1,8 @@
-"""Check and time the fused update of PPO on random observations, and write metrics.
+"""Check and time PPO's update by fused Triton kernels on random observations, and write metrics.
 
     python experiments/fused_update.py --out outputs/fused_update
 
-It needs a GPU of compute capability 8.0 or higher and Triton. Gradients of a minibatch are compared with autograd in
+It needs a GPU of compute capability 8.0 or higher. Gradients of a minibatch are compared with autograd in
 float64 on the same samples, without and with the mirror-symmetric actor. Products of bfloat16 cause errors of 0.6 %
 for the critic. For the actor they are 2 to 11 %, since rounding moves 0.4 % of the samples across the bounds of the
 clipping, in a test with large actions; in CPU emulation with small actions they are 1 to 2 %. Two trainings with one

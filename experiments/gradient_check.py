@@ -33,7 +33,7 @@ class Ascent:
 
 
 def ascend(device: str | None) -> Ascent:
-    """Raise the apex of the jump with WEAK_PUSH by ASCENT_STEPS normalised gradient steps on all motor targets."""
+    """Raise the apex of a jump with a weak push-off by ASCENT_STEPS normalised gradient steps on all motor targets."""
     jump = GradientJump(1, double=False, device=device)
     targets, heights = schedule(WEAK_PUSH), []
     for _ in range(ASCENT_STEPS):
@@ -45,7 +45,7 @@ def ascend(device: str | None) -> Ascent:
 
 
 def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path: Path) -> None:
-    """Plot gradient and differences over the targets' time, the jump's height, and the ascent into a file.
+    """Plot the apex's gradient and central differences over time, the jump's height, and the ascent into a file.
 
     jump: in one world; actions: (gradient, differences) [m/rad], FL outer then FL inner, TICKS values each.
     """

@@ -58,7 +58,7 @@ class Args(OutputArgs):
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Identify known robots and test the predictions, for each of `args.parts`; write and return the metrics.
+    """Identify known robots and test the predictions in the selected parts of the test; write and return the metrics.
 
     The computation is on the CPU.
     """

@@ -97,7 +97,7 @@ def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Identify the robots whose lines are missing in the folder, and write and return the metrics of all."""
+    """Compute the fits that are missing in the output folder, and write and return the metrics of all fits."""
     folder = output_dir("identification_starts", args.out)
     path = folder / f"{args.stream}.jsonl"
     fits = saved_fits(path)

@@ -48,7 +48,7 @@ class Args(DeviceArgs):
             with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
-        """Return the spring jumps with these flags and the command filter `name`, a key of FILTERS."""
+        """Return the jumps with knee springs for these flags and the command filter `name`, a key of FILTERS."""
         motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
         return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)

@@ -1,4 +1,4 @@
-"""Train the paper's tasks and the ablations of its thesis, test them as the paper did, and write metrics of each.
+"""Train the paper's tasks and ablations of its three techniques, test them as the paper did, and write metrics of each.
 
     python experiments/paper_trainings.py --tasks vertical-jump-paper --arms full --seeds 0 --out outputs/paper
     python experiments/paper_trainings.py --table --out outputs/paper     # table and curves so far
@@ -105,7 +105,7 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run all trainings in turn, print the table and plot the learning curves; return the primary metric of each."""
+    """Run and test all trainings in turn, print a table, plot learning curves; return the primary metric of each."""
     folder, results = prepare("paper_trainings", args, args.threads), {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")

@@ -1,4 +1,4 @@
-"""Pages of the Python API: a page for each area with autodoc of its modules, and plain-text docstrings for autodoc."""
+"""Pages of the Python API, one for each area with autodoc of its modules, and conversion of docstrings for autodoc."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def module_text(module: str) -> str:
 
 
 def api_pages() -> dict[str, str]:
-    """Return the pages in reStructuredText by file name."""
+    """Return the pages of the Python API in reStructuredText by file name."""
     pages = {}
     for name, (title, modules) in AREAS.items():
         parts = [title, "=" * len(title), "", *map(module_text, modules)]
@@ -85,7 +85,7 @@ def api_pages() -> dict[str, str]:
 
 
 def api_table() -> str:
-    """Return the table of all pages and their modules, and the table of contents, in Markdown."""
+    """Return the table of all API pages and their modules, and the table of contents, in Markdown."""
     rows = [f"| [{title}](../reference/api/{name}.rst) | {', '.join(f'`{module}`' for module in modules)} |"
             for name, (title, modules) in AREAS.items()]  # fmt: skip
     contents = ["```{toctree}", ":hidden:", *(f"api/{name}" for name in AREAS), "```"]
@@ -93,7 +93,7 @@ def api_table() -> str:
 
 
 def plain_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Replace a docstring by reStructuredText with the same appearance; a field without one has its comment."""
+    """Convert the lines of a docstring to reStructuredText in place; a field without a docstring gets its comment."""
     if what == "attribute" and (not lines or lines[0].startswith("Alias for field number")):
         lines[:] = [_field_comment(name)]
     lines[:] = to_rst("\n".join(lines)).splitlines()
@@ -110,6 +110,6 @@ def _field_comment(name: str) -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the conversion of docstrings."""
+    """Register the conversion of docstrings with Sphinx."""
     app.connect("autodoc-process-docstring", plain_docstring)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Page of the command line, as MyST Markdown from the settings of the commands."""
+"""Reference page of the `jumper` commands, as MyST Markdown from their settings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FULL_LIST = 10  # Largest number of flags without a second list
 
 
 def cli_page() -> str:
-    """Return the Markdown of the page: one section for each command, then exit codes and completion."""
+    """Return the Markdown of the command reference: a section for each command, then completion and exit codes."""
     train = settings_of("train")[0]
     parts = [
         section("train TASK", COMMANDS["train"], list_flags(train), headings=SHORT_HELP,
@@ -62,7 +62,7 @@ def cli_page() -> str:
 
 
 def summary() -> str:
-    """Return the table of all commands."""
+    """Return the Markdown table of all commands and their purposes."""
     anchors = {
         "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
@@ -147,7 +147,7 @@ def meaning(flag: Flag) -> str:
 
 
 def dropdown(title: str, content: str) -> str:
-    """Return a collapsed block."""
+    """Return the Markdown of a collapsed block with a title."""
     return f":::::{{dropdown}} {title}\n\n{content}\n:::::"
 
 

@@ -56,7 +56,7 @@ def text(value: Any) -> str:
 
 
 def term_text(term: Term) -> str:
-    """Return the numbers of a term as text, without defaults of its class, and whether its form is the paper's."""
+    """Return the numbers of a reward or other term as text, without defaults, and whether its form is the paper's."""
     kind = type(term)
     values = {key: value for key, value in term.numbers.items() if value != kind.settings.get(key, REQUIRED)}
     values |= {key: option for key, option in term.options.items()
@@ -66,7 +66,7 @@ def term_text(term: Term) -> str:
 
 
 def settings(value: Any, where: str) -> dict[str, str]:
-    """Return the settings of a part of a task as text by dotted name."""
+    """Return a field of a task, such as `rewards`, as text by the dotted names of its settings."""
     if isinstance(value, tuple) and value and all(isinstance(part, Term) for part in value):
         return {f"{where}.{part.name}": term_text(part) for part in value}
     if isinstance(value, tuple) and value and all(dataclasses.is_dataclass(part) for part in value):
@@ -95,9 +95,10 @@ def numbers(name: str, task: TaskCfg | None = None) -> dict[str, str]:
 
 
 def rows_of(name: str, task: TaskCfg | None = None) -> dict[str, tuple[str, str]]:
-    """Return (ours, paper) by dotted name: all numbers of a task with a paper, else those unlike the base's.
+    """Return (our value, the paper's value) of the settings of a task as text by dotted name.
 
-    Without a paper's task the second text is empty. task: as in `numbers`.
+    A task without a task of the paper has only the settings unlike its base's, with empty second texts. task: as in
+    `numbers`.
     """
     ours = numbers(name, task)
     other = numbers(PAPERS[name]) if name in PAPERS else numbers(BASES[name]) if BASES[name] else {}
@@ -109,13 +110,13 @@ def rows_of(name: str, task: TaskCfg | None = None) -> dict[str, tuple[str, str]
 
 
 def read(path: Path = FILE) -> list[dict[str, str]]:
-    """Return the rows of the file, cells by column."""
+    """Return the rows of `departures.csv`, cells by column."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def main() -> None:
-    """Write the present numbers into the file; sources, reasons and values of other papers stay."""
+    """Write the tasks' present numbers into `departures.csv`; sources, reasons and values of other papers stay."""
     old = {(row["task"], row["name"]): row for row in read()} if FILE.exists() else {}
     with FILE.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

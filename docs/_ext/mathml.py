@@ -27,13 +27,13 @@ def mathml(node: nodes.Element, *, as_block: bool) -> str:
 
 
 def visit_inline(translator: Any, node: nodes.math) -> None:
-    """Write a formula in a line of text."""
+    """Write a formula in a line of text to the HTML page."""
     translator.body.append(mathml(node, as_block=False))
     raise nodes.SkipNode
 
 
 def visit_block(translator: Any, node: nodes.math_block) -> None:
-    """Write a formula on a line of its own, with its number if it has one."""
+    """Write a formula on a line of its own to the HTML page, with its number if it has one."""
     number = f"({get_node_equation_number(translator, node)}) " if node["number"] else ""
     anchor = f' id="{node["ids"][0]}"' if node["ids"] else ""
     translator.body.append(f'<div class="formula"{anchor}>{number}{mathml(node, as_block=True)}</div>')
@@ -41,6 +41,6 @@ def visit_block(translator: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the renderer."""
+    """Register MathML as Sphinx's renderer of formulas."""
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

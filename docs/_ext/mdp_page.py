@@ -38,7 +38,7 @@ class Section(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A page: title, first sentence, and sections; pages of `SPACES` also have the terms of their namespace."""
+    """Page about a part of `jumper_warp.mdp`; a page named in `SPACES` also describes the terms of that namespace."""
 
     title: str
     about: str
@@ -81,7 +81,7 @@ PAGES = {
 
 
 def mdp_pages() -> dict[str, str]:
-    """Return the Markdown of the pages by file name, with `mdp.md`, the table of all pages and names."""
+    """Return the Markdown of all pages about `jumper_warp.mdp` by file name, with a table of all names in `mdp.md`."""
     inner = {struct.key: (f"{struct.cls.__module__}.{struct.key}", struct) for struct in INNER_STRUCTS}
     used, pages, rows = tasks_by_function(), {}, []
     for key, page in PAGES.items():
@@ -107,7 +107,7 @@ def term_sections(space: str) -> list[tuple[str, list[tuple[str, Any]]]]:
 
 
 def described_thing(name: str, thing: Any, tasks: Sequence[str] | None) -> str:
-    """Return the directive that describes an object; tasks: names of those that use it as a term."""
+    """Return the Sphinx directive that documents an object; tasks: names of those that use it as a term."""
     if isinstance(thing, wp.Function):
         return function_entry(name, thing, tasks)
     if isinstance(thing, STRUCT):
@@ -137,7 +137,7 @@ def plain_type(annotation: ast.expr) -> str:
 
 
 def split(pattern: re.Pattern[str], text: str) -> tuple[str, str]:
-    """Return what a pattern finds at the start of a text, and the rest."""
+    """Split a text into the match of a pattern at its start, empty if there is none, and the rest."""
     match = pattern.match(text)
     return (match[1], text[match.end() :]) if match else ("", text)
 
@@ -203,7 +203,7 @@ def task_class(name: str, kind: type) -> str:
 
 
 def constant(name: str, value: int) -> str:
-    """Return the entry of a phase of a jump."""
+    """Return the entry of an integer constant that names a phase of a jump."""
     module: Any = inspect.getmodule(mdp.commanded.func)
     comment = re.search(rf"^{name.rpartition('.')[2]} = .*?# (?:phases: )?(.*)$", inspect.getsource(module), re.M)
     return described("data", name, "", f"Phase of a jump, {value}: {to_markdown(comment[1] if comment else '')}.")

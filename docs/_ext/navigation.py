@@ -13,7 +13,7 @@ from sphinx.environment import BuildEnvironment
 
 @cache
 def titles(env: BuildEnvironment) -> dict[str, nodes.bullet_list]:
-    """Return the contents of all pages by name; below a page's title stand only its lists of pages."""
+    """Return the navigation list of every page by its name: the page's title and its subpages, without headings."""
     found = {}
     for page, contents in env.tocs.items():
         found[page] = contents
@@ -26,7 +26,7 @@ def titles(env: BuildEnvironment) -> dict[str, nodes.bullet_list]:
 
 
 def use_titles(app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
-    """Make the navigation tree of one page without headings."""
+    """Replace the navigation tree of a page's template by one that omits headings if the theme requests titles only."""
     full = context["toctree"]
 
     def toctree(**options: Any) -> str:
@@ -41,6 +41,6 @@ def use_titles(app: Sphinx, page: str, template: str, context: dict[str, Any], d
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the navigation tree before the theme asks for it."""
+    """Register the navigation tree with Sphinx, before the theme uses it."""
     app.connect("html-page-context", use_titles, priority=400)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

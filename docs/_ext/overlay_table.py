@@ -1,4 +1,4 @@
-"""Table of the values of a robot overlay, as Markdown, from the ranges and comments in the code.
+"""Markdown table of the values that a robot overlay (a robot's JSON file) may have, from ranges and comments in code.
 
     python docs/_ext/overlay_table.py
 
@@ -23,7 +23,7 @@ COMMENT = re.compile(r"\(N, \d+\) \[(?P<unit>[^\]]*)\],? ?(?P<content>.*)", re.D
 
 
 def described(values: np.ndarray) -> str:
-    """Return the described values of one robot as text; values: (columns,)."""
+    """Format a quantity of the robot description as text, equal values once; values: (columns,)."""
     texts = [f"{value:.5g}" for value in values]
     if len(set(texts)) == 1:
         return texts[0]
@@ -33,7 +33,7 @@ def described(values: np.ndarray) -> str:
 
 
 def overlay_table() -> str:
-    """Return the Markdown table of all values that an overlay may have."""
+    """Return the Markdown table of all values that a robot overlay may have."""
     docs, nominal, rows = field_docs(RobotValues), vars(RobotValues.nominal(1)), []
     kinds = ", ".join(LINK_KINDS).replace("_", " ")
     for name, allowed in RANGES.items():
@@ -47,7 +47,7 @@ def overlay_table() -> str:
 
 
 def with_table(page: str) -> str:
-    """Return the text of the page with the table between the markers."""
+    """Return the text of a page with the table of overlay values between its two marker comments."""
     before, rest = page.split(BEGIN)
     return f"{before}{BEGIN}\n{overlay_table()}\n{END}{rest.split(END)[1]}"
 

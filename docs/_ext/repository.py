@@ -1,4 +1,4 @@
-"""Links from pages to files of the repository that are no pages, and pages made of files outside docs/."""
+"""Conversion of links to files outside docs/ in the documentation's pages, and in Markdown files that they include."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def relocated(text: str, source: str, target: str) -> str:
 
 
 def relocate_included(app: Sphinx, path: Path, parent: str, content: list[str]) -> None:
-    """Make the links of an included file work in the page that includes it."""
+    """Change the links of an included file in place so that they work in the page that includes it."""
     target = posixpath.dirname(app.env.docname)
     content[0] = relocated(content[0], path.parent.as_posix(), target)
 
@@ -61,7 +61,7 @@ class RepositoryLinks(SphinxTransform):
         return Path(os.path.normpath(Path(self.env.doc2path(self.env.docname)).parent / target)), fragment or None
 
     def replacement(self, link: Any, path: str, fragment: str | None) -> nodes.Node:
-        """Return what stands in place of a link to a file or folder of the repository."""
+        """Return the node that replaces a link to a file or folder of the repository."""
         if page := self.config.repository_pages.get(path):
             attributes = {"refdomain": "doc", "reftarget": page, "reftargetid": fragment}
             return addnodes.pending_xref("", *link.children, refdoc=self.env.docname, reftype="myst",
@@ -75,7 +75,7 @@ class RepositoryLinks(SphinxTransform):
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register settings, event and transform."""
+    """Register the conversion of links, and its settings, with Sphinx."""
     app.add_config_value("repository", "", "env", str)
     app.add_config_value("repository_pages", {}, "env", dict)
     app.connect("include-read", relocate_included)

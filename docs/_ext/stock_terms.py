@@ -1,4 +1,4 @@
-"""The Warp functions of `jumper_warp.mdp` and of the project's tasks, by kind of term."""
+"""Warp functions of `jumper_warp.mdp` and of the project's tasks: rewards, terminations, observations and events."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EMPTY = inspect.Signature.empty
 
 
 def is_term(space: str, func: Any) -> bool:
-    """Return whether a Warp function has the signature of the terms of a namespace."""
+    """Return whether a Warp function has the signature of a term, such as a reward; space: key of `SPACES`."""
     signature = inspect.signature(func.func)
     names, returns = list(signature.parameters), signature.return_annotation
     if space == "events":
@@ -38,7 +38,7 @@ def is_term(space: str, func: Any) -> bool:
 
 
 def functions_of(module: ModuleType, fits: Callable[[Any], bool]) -> dict[str, Any]:
-    """Return the Warp functions that a module defines and that fit, by name."""
+    """Return the Warp functions that a module defines and for which `fits` returns True, by name."""
     defined = {name: value for name, value in vars(module).items() if isinstance(value, wp.Function)}
     return {name: func for name, func in defined.items() if func.func.__module__ == module.__name__ and fits(func)}
 
@@ -50,7 +50,7 @@ def stock_terms(space: str) -> dict[str, Any]:
 
 
 def helpers(space: str) -> dict[str, Any]:
-    """Return the functions of a namespace of stock terms that are no terms, by full name."""
+    """Return the auxiliary functions of a namespace of stock terms, which are no terms, by full name."""
     others = functions_of(SPACES[space], lambda func: not is_term(space, func))
     return {f"{mdp.__name__}.{space}.{name}": func for name, func in others.items()}
 
@@ -69,7 +69,7 @@ def task_terms(space: str, kind: str) -> dict[str, Any]:
 
 @cache
 def tasks_by_kind() -> dict[str, list[str]]:
-    """Return the names of the project's tasks by a key of `TASK_KINDS`."""
+    """Return the names of the project's tasks, grouped by the keys of `TASK_KINDS`."""
     kinds: dict[str, list[str]] = {}
     for name in TASKS:
         kinds.setdefault(make_task(name).state.cls.__module__.split(".")[2], []).append(name)
@@ -77,7 +77,7 @@ def tasks_by_kind() -> dict[str, list[str]]:
 
 
 def words_for_tasks(names: Sequence[str]) -> str:
-    """Return tasks in words: those of a kind that are complete as "all jumps"."""
+    """Describe a list of tasks in words; all tasks of a kind together are named "all jumps"."""
     if set(names) == set(TASKS):
         return "all tasks"
     words = []

@@ -1,4 +1,4 @@
-"""No line break between a number and its unit, outside of code."""
+"""Sphinx transform that prevents line breaks between a number and its unit, outside of code."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def joined(text: str) -> str:
 
 
 class Units(SphinxTransform):
-    """Put no-break spaces before the units of a page."""
+    """Transform of a page that puts no-break spaces before units."""
 
     default_priority = 999  # after links and signatures
 
     def apply(self, **_: Any) -> None:
-        """Change the texts of one page."""
+        """Replace spaces before units in the texts of one page."""
         for text in [*self.document.findall(nodes.Text)]:
             if SPACE.search(text) and not isinstance(text.parent, CODE):
                 text.parent.replace(text, nodes.Text(joined(str(text))))
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the transform."""
+    """Register the transform `Units` with Sphinx."""
     app.add_transform(Units)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

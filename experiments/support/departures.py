@@ -45,7 +45,7 @@ def places_of_paper(task: TaskCfg) -> TaskCfg:
 
 
 def places_of_sequel(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the Mars task with goals 1.4 to 4.75 m ahead in the sequel's four steps of two levels each."""
+    """Return a copy of the Mars task with the goals of the authors' sequel, 1.4 to 4.75 m ahead, in four steps."""
     (_, *low), (_, *top) = task.levels[-1].goal_lower, task.levels[-1].goal_upper
     ahead = ((1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75))
     return with_goals(task, [((near, *low), (far, *top)) for near, far in ahead], starts=2)

@@ -1,4 +1,4 @@
-"""Robots far from the description: drawn, recorded with several noises, identified, and compared with the truth."""
+"""Robots with parameters far from the described: sampled, recorded with noise, identified, compared with the truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DRAWS = 10_000  # Number of sampled errors of an estimate
 
 
 def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
-    """Draw normalised parameters (P,) of a robot with masses, gains, friction and latency far from the described."""
+    """Sample normalised parameters (P,) of a robot with masses, gains, friction and latency far from the described."""
     z = OWN * rng.normal(size=len(parameters))
     for quantity in FAR:
         members = [i for i, parameter in enumerate(parameters) if parameter.quantity == quantity]
@@ -41,7 +41,7 @@ def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def is_good(error: np.ndarray) -> np.ndarray:
-    """Return whether fits are good, (...): few errors (..., P) [standard deviations] beyond 95 % limits, none far."""
+    """Return which fits are good, (...): few errors (..., P) [standard deviations] beyond 95 % limits, none far."""
     outside = (error > CONFIDENCE).mean(axis=-1)
     return (outside <= MOST_OUTSIDE) & (error.max(axis=-1) <= FARTHEST_OUTSIDE)
 
@@ -58,7 +58,7 @@ def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Ge
 
 
 def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]:
-    """Draw a robot, record its motions, identify it on one CPU thread, and return the result as one line of JSON.
+    """Sample a robot, record its motions, identify it on one CPU thread, and return the result as JSON data.
 
     robot, noise: indices of the robot with its motions, and of the noise of its sensors and scale.
     """

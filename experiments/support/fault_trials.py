@@ -87,7 +87,7 @@ class Trial:
         return code
 
     def operation(self, start: float = 0.0, end: float = 1.0) -> int:
-        """Return the number of a random file operation between fractions `start` and `end` of the training's rest."""
+        """Return the number of a random file operation from fraction `start` to `end` of the remaining training."""
         total, done = reference(self.training_seed, 1, self.folder.parent).operations, self.saved_iteration()
         rest = total * (1.0 - done / faults.ITERATIONS)
         return 1 + int(rest * self.rng.uniform(start, end))
@@ -110,7 +110,7 @@ class Trial:
         self.events.append(Event(fault, max(0, max(reached, default=0) - self.saved_iteration())))
 
     def finish(self, ranks: int = 1) -> None:
-        """Train to the end, and check that checkpoint and metrics are those of an undisturbed training."""
+        """Resume the training to its end; check that checkpoint and metrics are those of an undisturbed training."""
         code = self.run(ranks=ranks)
         check(code == 0, f"exit code {code} of the last training: {self.text[-300:]}")
         folder, expected = self.run_folder(), reference(self.training_seed, ranks, self.folder.parent)

@@ -163,7 +163,7 @@ def fill_disk(folder: Path, left: int) -> None:
 
 
 def digest(state: dict[str, Any]) -> dict[str, str]:
-    """Return a checksum of each part of a checkpoint's contents: algorithm, environment, generators, other ranks."""
+    """Return checksums of a checkpoint by part: iteration, algorithm, environment, random generators, other ranks."""
     return {part: _checksum(state[part]) for part in ("iteration", "ppo", "env", "rng", "others")}
 
 

@@ -1,4 +1,4 @@
-"""Identification by other methods, SciPy and CMA-ES, on the same data and in the same parallel worlds."""
+"""Identification of a robot by SciPy and CMA-ES, to compare them with `jumper_warp.identification` on the same data."""
 
 from __future__ import annotations
 

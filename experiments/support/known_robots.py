@@ -30,7 +30,7 @@ SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
 
 @dataclass
 class Case:
-    """A known robot, its recorded motions, and a held-out jump."""
+    """A simulated robot with known parameters, its recorded motions, and a held-out jump."""
 
     truth: np.ndarray  # (parameters,) True parameters, normalised by the priors
     robots: RobotValues  # The same parameters in their units, one robot

@@ -25,9 +25,9 @@ def pages() -> list[Path]:
 
 
 def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the text of a page by its name: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice`, `seeds`.
+    """Make the generated table `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice` or `seeds` of a page.
 
-    Raises InputError: there is no such text.
+    Raises InputError: there is no such table.
     """
     kind, _, subject = name.partition(" ")
     if kind in ("main", "all") and subject in tasks:

@@ -117,7 +117,7 @@ class SoakTotals(NamedTuple):
 
 
 class SoakCounters:
-    """Counters of invalid worlds and unsolved contacts, and of the largest speeds, on the device."""
+    """Counts of non-finite worlds and unsolved contacts so far, and largest speeds, on the device."""
 
     def __init__(self, sim: Simulation) -> None:
         """Start all counters at 0; sim: simulation whose state is read."""
@@ -259,10 +259,10 @@ def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
 
 
 def soak_tasks(args: SoakArgs, folder: Path) -> dict:
-    """Soak-test environments of one task or of all in turn, in parts, and return the metrics of all parts.
+    """Soak-test one environment after another, of one task or of all in turn, and return the metrics of all together.
 
-    The parts are in a file in the folder. With `args.max_seconds` its parts count too, and parts run while there is
-    time for another one.
+    Each test is a part in a file in the folder. With `args.max_seconds` earlier parts count too, and parts run while
+    there is time for another one.
     """
     start, longest, path = time.perf_counter(), 0.0, folder / PARTS
     parts = [json.loads(line) for line in path.read_text().splitlines()] if args.max_seconds and path.is_file() else []
@@ -286,7 +286,7 @@ def soak_tasks(args: SoakArgs, folder: Path) -> dict:
 
 
 def total_metrics(parts: list[dict]) -> dict:
-    """Return the metrics of all parts of a soak test together, and the steps of each task."""
+    """Return the sums or largest values of metrics over soak tests (parts), and the steps of each task."""
     metrics = {name: max(part[name] for part in parts) for name in parts[0] if name.startswith("largest")}
     names = ("steps", "non_finite_worlds", "non_finite_rows", "unsolved_contacts", "wall_s", "resident_growth_kib")
     metrics |= {name: sum(part[name] for part in parts) for name in names}

@@ -49,7 +49,7 @@ class KickedWalks(VelocityLog):
     kick: np.ndarray  # [m/s] (robots, 2) Step change of the velocity, world axes
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the arrays of `VelocityLog.read_env`, and set due kicks."""
+        """Return the arrays of `VelocityLog.read_env`, and add due kicks to the bases' velocities."""
         arrays = super().read_env(env)
         kicked = np.round(self.kick_time / env.step_dt).astype(int) == len(self.velocity) + 1
         if kicked.any():

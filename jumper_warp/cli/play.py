@@ -1,4 +1,4 @@
-"""`jumper play POLICY` records a policy for the Rerun viewer, `jumper play --script FILE` several in sequence.
+"""`jumper play POLICY` records a policy for the Rerun viewer, `jumper play --script FILE` several policies in sequence.
 
 The policy comes first: its task decides which flags there are. A script lists the commands to one robot.
 `jumper play --dump FILE` shows the state in which a term of a training was not finite.

@@ -247,7 +247,7 @@ class DumpCfg:
 
 
 def play_dump(cfg: DumpCfg) -> Path:
-    """Write a recording of one frame and a picture of the state in a dump, and print its values; return the recording.
+    """Write a recording and a picture of a robot state dumped for a non-finite value, print it; return the recording.
 
     The robot is shown on level ground. Raises InputError: the file is no dump; OSError: the folder cannot be created.
     """

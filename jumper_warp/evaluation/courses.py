@@ -303,7 +303,7 @@ def _row_max(values: np.ndarray) -> np.ndarray:
 
 
 def course_metrics(course: CourseLog) -> Metrics:
-    """Return rates of finished courses and falls, errors of jumps and tracking, and forces at handovers.
+    """Return rates of finished courses and falls, errors of jumps and tracking, and forces at switches to a jump.
 
     `finished_rate` is the fraction of robots that finished every command without a fall; it ignores errors.
     `finished_on_goal_rate` also requires all jumps within 0.1 m of their goals. Tracking errors are those of slewed
@@ -342,7 +342,7 @@ def course_metrics(course: CourseLog) -> Metrics:
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ripple of paw forces before each handover to a jump, and their change at it [N], (handovers,) each.
+    """Return the ripple of paw forces before each switch (handover) to a jump, and their step at it [N], (handovers,).
 
     Ripple: peak-to-peak force over the last FORCE_WINDOW seconds before the handover; step: change of the force between
     the policy steps before and after it. Each is the maximum over the four paws.

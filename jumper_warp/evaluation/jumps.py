@@ -42,7 +42,7 @@ def with_jump_terminations(task: TaskCfg) -> TaskCfg:
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of a task whose episodes also end, before success, at a second takeoff (the authors' rule)."""
+    """Return a copy of a task that ends evaluated jumps also at a second takeoff, as a failure (the authors' rule)."""
     task = with_jump_terminations(task)
     takeoff = TerminationTerm(second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))

@@ -152,7 +152,7 @@ class Run(ABC):
         return values
 
     def note_robot(self, env: Env) -> None:
-        """Remember for the report an environment's robot overlay, and the ranges of randomisation around it."""
+        """Store an environment's robot overlay (file of the robot) and randomisation ranges for the report."""
         if env.overlay is None:
             return
         if self.conditions.robot is None:

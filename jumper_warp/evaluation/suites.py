@@ -1,4 +1,4 @@
-"""Test suites of jumps to landing positions other than the sweep, and the table of all suites.
+"""Test suites of jumps: grid, ring, jumps in a row, other grounds, farthest distance; and the table of all suites.
 
 `jumper evaluate POLICY --suite NAME` runs a suite. Headings are sampled from the full circle; `jump_metrics` defines
 the metrics.
@@ -215,7 +215,7 @@ class Platform(Suite):
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
     def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
-        """Yield each ground: name, arguments for `Env`, headings [rad] (num_envs,); goals [m]: (num_envs, 2)."""
+        """Yield the test grounds: name, arguments for `Env`, headings [rad] (num_envs,); goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
         bumps = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
@@ -227,7 +227,7 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def outlines(self, goals: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-        """Return by scene what plots outline on the ground: platform, block, and level ground among bumps."""
+        """Return the outlines in plots by scene, title and corners [m]: platform, block, level ground among bumps."""
         x, y = np.median(goals, axis=0)
         block = rectangle(self.edge, x + BLOCK_BEYOND, y - 0.5 * BLOCK_WIDTH, y + 0.5 * BLOCK_WIDTH)
         level = regular_polygons(np.zeros((1, 2)), FLAT_RADIUS)

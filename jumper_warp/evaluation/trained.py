@@ -32,7 +32,7 @@ class Bounds(NamedTuple):
 
 
 def trained_bounds(task: TaskCfg) -> tuple[Bounds, ...]:
-    """Return the ranges of all components that a task samples at any level; empty unless it jumps or walks."""
+    """Return the ranges of all command components over a task's curriculum levels; empty unless it jumps or walks."""
     levels: Any = task.levels or (None,)
     if hasattr(levels[0], "goal_lower"):
         lower = np.min([level.goal_lower for level in levels], axis=0).tolist()
@@ -80,7 +80,7 @@ def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
 
 
 def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
-    """Return the success rates of jumps to first goals within and beyond the range of training, if there are both.
+    """Return the success rates of first jumps with goals within and beyond the range of training, if both occur.
 
     Keys: `within_training_success_rate`, `beyond_training_success_rate`.
     """

@@ -59,7 +59,7 @@ def variance_factor(columns: Sequence[np.ndarray]) -> float:
 
 
 class Sensor(NamedTuple):
-    """A motor's measured angle and rate, or a channel of the base, in one motion, with Fisher information and score."""
+    """Sensor in one motion: a motor's angle and rate or a channel of the base, with Fisher information and score."""
 
     motion: MotionResiduals
     name: str  # such as "BL_outer" or "position"

@@ -191,7 +191,7 @@ class Descent:
         return point, normal
 
     def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> Minimum:
-        """Minimise the last stage's problem, also from other values of the paws' friction if one lowers the cost.
+        """Find the local minimum near a point, and again from another friction of the paws if that lowers the cost.
 
         normal: the normal equations at the point.
         """

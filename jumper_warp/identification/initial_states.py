@@ -220,7 +220,9 @@ def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
 
 
 def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
-    """Return the smallest change of motor angles per change of `unevenness`, (12,) [rad/m], at angles (12,) [rad]."""
+    """Return the smallest motor motion, (12,) [rad/m], that moves a paw from the plane of the others (`unevenness`).
+
+    angle: (12,) [rad]."""
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
     return slope / (slope @ slope)

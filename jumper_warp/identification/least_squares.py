@@ -143,7 +143,7 @@ def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.n
 
 
 class LeastSquares:
-    """Least-squares problem of motions, prior measurements and parameters with priors, evaluated in parallel worlds."""
+    """Least-squares problem of an identification: residuals of motions, prior measurements and parameters' priors."""
 
     def __init__(
         self,

@@ -100,7 +100,7 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
-    """Return the state in which a planned motion begins: at rest in the first targets' pose; if free, 1 mm up."""
+    """Return the initial state of a planned motion: at rest in the first targets' pose; if free, 1 mm above ground."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":

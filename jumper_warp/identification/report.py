@@ -81,7 +81,7 @@ def to_json(result: Identification) -> dict[str, Any]:
 
 
 def write_results(result: Identification, folder: Path, source: str) -> None:
-    """Write a robot overlay, `report.json` and `report.html` to a folder. Raises OSError.
+    """Write the identified robot (a robot overlay), `report.json` and `report.html` to a folder. Raises OSError.
 
     The overlay is `identified.json`, or `inconsistent.json` if the fit is not consistent; an earlier one of the other
     name is removed. source: origin of the data, saved in the overlay.
@@ -96,7 +96,7 @@ def write_results(result: Identification, folder: Path, source: str) -> None:
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
-    """Return the identified robot as an overlay, with 95 % intervals as randomisation ranges; source: saved text."""
+    """Return the identified robot as a robot overlay, its 95 % intervals as randomisation ranges; source: text."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
 

@@ -71,7 +71,7 @@ class Minimum(NamedTuple):
 
 @dataclass(frozen=True)
 class Start:
-    """Comparison of one start of the optimisation with the best start, by cost and parameters."""
+    """Comparison of the minimum from one start of the optimisation with the best one, by cost and parameters."""
 
     excess: float  # [1] Cost above that of the best start, over χ² if that is above 1
     difference: float
@@ -79,7 +79,7 @@ class Start:
 
 
 def excess_costs(problem: LeastSquares, minima: Sequence[Minimum]) -> np.ndarray:
-    """Return by how much the cost of each minimum (K,) exceeds the first, best one's, over its χ² if above 1."""
+    """Return the excess cost (K,) of each minimum over the best, the first, divided by the best one's χ² if above 1."""
     costs = np.array([minimum.normal.cost for minimum in minima])
     return (costs - costs[0]) / problem.scale(minima[0].normal) if minima else costs
 
@@ -220,7 +220,7 @@ def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
 
 
 def trapped_spread(problem: LeastSquares, minimum: Minimum, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (P,) of z that the linear model misses as a paw may stick instead of slip.
+    """Return standard deviations (P,) of normalised parameters that a linear model misses, as a paw may also stick.
 
     covariance: of the linear model, (P, P).
     """

@@ -154,7 +154,7 @@ def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Return the constraint that the robot takes off; else the lowest paw must rise to `lift` [m] at the end.
+    """Return the constraint that the robot takes off, else by how far the lowest paw is below `lift` [m] at the end.
 
     The second condition has a gradient; its value is scaled to 0.1 m and stays above 0.
     """
@@ -231,5 +231,5 @@ def rest() -> Term:
 
 
 def still(dead_band: float = 0.001) -> Term:
-    """Return the objective: `lifted` plus half of `rest`, for a motion that ends at rest on planted paws."""
+    """Return the objective of ending at rest on planted paws: `lifted` plus half of `rest`."""
     return lambda motion: lifted(dead_band)(motion) + 0.5 * rest()(motion)

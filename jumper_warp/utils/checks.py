@@ -170,6 +170,6 @@ def check_filter_speed(horizon: float, speed_floor: float) -> None:
 
 
 def version_error(version: str, known: int) -> str:
-    """Return the error message for a file of unsupported format `version`, with the commit that reads `known - 1`."""
+    """Return the error message for a file of unsupported format `version`; it names the commit for `known - 1`."""
     previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
     return f"has version {version}, expected version {known}; {previous}"

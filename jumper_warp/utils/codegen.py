@@ -34,7 +34,7 @@ def codegen_error(error: Exception) -> tuple[str, str] | None:
 
 @contextmanager
 def explained(types: Iterable[Any]) -> Iterator[None]:
-    """Turn Warp's errors in the block about functions that it cannot compile into InputError, with file and line.
+    """Convert Warp's errors about functions that do not compile, raised in the block, to InputError with file and line.
 
     types: of the function's arguments; their structs have the fields that it may use. Other exceptions propagate.
     """

@@ -36,7 +36,7 @@ class NonFiniteValue(NamedTuple):
 
 
 def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
-    """Write a value and the state of its world to a NumPy archive without pickles; header: further JSON data.
+    """Write a non-finite value and the state of its world to a NumPy archive; header: further JSON data.
 
     Raises OSError: the file cannot be written.
     """
@@ -50,7 +50,7 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
 
 
 def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
-    """Return the value and the header in a file of `write_dump`.
+    """Read the non-finite value, and the header, in a file of `write_dump`.
 
     Raises InputError: the file is missing, damaged, of another kind or of another version.
     """

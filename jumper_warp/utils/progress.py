@@ -64,7 +64,7 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
 
 
 def shown(title: str, function: Callable[P, T]) -> Callable[P, T]:
-    """Return a version of a function that shows its progress in the main thread, unless another `phase` is shown."""
+    """Return a version of a function that displays `title` while it runs in the main thread outside a `phase`."""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
