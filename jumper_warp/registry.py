@@ -161,7 +161,7 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-flat": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score",
         "walk on level ground",
-        {"laptop": f"{LAPTOP_WALK} --ppo.final-desired-kl 0.01 --ppo.entropy-coef 0.006 --max-iterations 1800"},
+        {"laptop": f"{LAPTOP_WALK} --ppo.final-desired-kl 0.001 --ppo.entropy-coef 0.006 --max-iterations 1800"},
     ),
     "velocity-rough": TaskEntry(
         "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score",
