@@ -65,13 +65,14 @@ class Flag(NamedTuple):
         return "" if self.kind is bool else metavar(self.kind)
 
 
-def list_flags(cfg: Any, prefix: str = "", group_about: str = "") -> list[Flag]:
+def list_flags(cfg: Any, prefix: str = "", group_about: str = "", *, described: bool = True) -> list[Flag]:
     """Return the flags of a settings dataclass, or of an instance with the defaults, in the order of its fields.
 
-    prefix: of all names, with its dot. group_about: of those that are not nested further.
+    prefix: of all names, with its dot. group_about: of those that are not nested further. described: whether the flags
+    have descriptions, whose reading from the sources takes long.
     """
     kind, flags = cfg if isinstance(cfg, type) else type(cfg), []
-    hints, docs = get_type_hints(kind, include_extras=True), field_docs(kind)
+    hints, docs = get_type_hints(kind, include_extras=True), field_docs(kind) if described else {}
     for spec in dataclasses.fields(cfg):
         hint, *marks = get_args(hint) if get_origin(hint := hints[spec.name]) is Annotated else (hint,)
         if tyro.conf.Suppress in marks:
@@ -84,7 +85,8 @@ def list_flags(cfg: Any, prefix: str = "", group_about: str = "") -> list[Flag]:
         nested = hint if default is dataclasses.MISSING else default
         about = settings.get("help") or docs.get(spec.name, "")
         if dataclasses.is_dataclass(nested):
-            flags += list_flags(nested, f"{prefix}{name}.", about) if name else list_flags(nested, prefix, group_about)
+            inner, group = (f"{prefix}{name}.", about) if name else (prefix, group_about)
+            flags += list_flags(nested, inner, group, described=described)
             continue
         name = name.upper() if tyro.conf.Positional in marks else prefix + name
         flags.append(Flag(name, hint, default, about, tuple(marks), group_about))
@@ -136,7 +138,7 @@ def check_numbers(settings: Any) -> None:
 
     settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others.
     """
-    for flag in list_flags(settings):
+    for flag in list_flags(settings, described=False):
         name = flag.name.split(".")[-1]
         limit = FLAG_LIMITS.get(name, MOST_TRIALS if name.startswith("num-") else LARGEST)
         for number in flag.default if isinstance(flag.default, tuple) else (flag.default,):

@@ -148,7 +148,8 @@ def parse(
     task_module = Flag(
         "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
     )
-    flags = [*list_flags(kind if default is None else default), *([task_module] if program is None else [])]
+    flags = list_flags(kind if default is None else default, described=wants_help(args))
+    flags += [task_module] if program is None else []
     program = program or f"jumper {command}"
     if wants_help(args):
         print(help_page(program, description or inspect.getdoc(kind) or "", flags, args, short), end="")

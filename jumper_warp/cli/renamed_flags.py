@@ -78,7 +78,7 @@ def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
     arg_names, new_args = [name_of(arg) for arg in args], list(args)
     if not any(name in RENAMED or name.startswith("env.") for name in arg_names):
         return new_args
-    current, renamed = {flag.name for flag in list_flags(cfg)}, {}
+    current, renamed = {flag.name for flag in list_flags(cfg, described=False)}, {}
     for i, old in enumerate(arg_names):
         new = None if old in current else new_name(old, current)
         if new is None:

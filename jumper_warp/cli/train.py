@@ -139,7 +139,8 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
 def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
     """Return the flags in unparsed arguments that a trainer does not use."""
     names = [name.replace("_", "-") for name in UNUSED.get(trainer, ())]
-    unused = {option for flag in list_flags(TrainArgs) if flag.name in names for option in flag.options}
+    flags = list_flags(TrainArgs, described=False)
+    unused = {option for flag in flags if flag.name in names for option in flag.options}
     return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
 
 

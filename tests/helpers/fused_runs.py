@@ -114,6 +114,47 @@ def failed_compilation():
     return str(error.value)
 
 
+class RecordedKernel:
+    """Kernel that records how it is compiled and launched."""
+
+    def __init__(self):
+        self.compiled, self.launched = [], 0
+
+    def warmup(self, *args, grid, num_warps, num_stages):
+        if args[-1] == 5:
+            raise RuntimeError("does not compile")
+        self.compiled.append((args, grid, num_warps, num_stages))
+
+    def __getitem__(self, grid):
+        def run(*args, num_warps, num_stages):
+            self.launched += 1
+
+        return run
+
+
+def compiled_variants():
+    """Return the compilations of a kernel launched with several arguments, and its launches meanwhile and afterwards.
+
+    The last item is the message of a kernel that does not compile.
+    """
+    from jumper_warp.rl.fused.networks import compile_side_by_side, launch
+
+    kernel, arguments = RecordedKernel(), [(torch.zeros(1), 3), (torch.ones(2), 3), (torch.zeros(1), 4), (None, 3)]
+    device = torch.device("cpu")
+
+    def launches(arguments=arguments):
+        for args in arguments:
+            launch(kernel, (7,), num_warps=8)(*args)
+
+    compile_side_by_side(launches, device)
+    meanwhile = kernel.launched
+    with pytest.raises(RuntimeError) as error:
+        compile_side_by_side(lambda: launches([(None, 5)]), device)
+    launches()
+    compiled = sorted((args[0] is not None, *args[1:], *options) for args, *options in kernel.compiled)
+    return compiled, meanwhile, kernel.launched, str(error.value)
+
+
 def whole_and_resumed(folder: Path):
     """Train for four iterations, then again from the second; return both last checkpoints."""
     cfg = push_cfg(folder, num_envs=8, ppo=dataclasses.replace(FUSED, symmetry="actor"))

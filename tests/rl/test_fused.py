@@ -9,6 +9,7 @@ import torch
 from fused_runs import (
     FUSED,
     NoiseTask,
+    compiled_variants,
     failed_compilation,
     interpreted,
     iterations,
@@ -80,6 +81,15 @@ def test_kernels_that_do_not_compile_are_an_input_error():
     assert interpreted(failed_compilation).startswith(
         "the fused kernels do not work here, pass --ppo.no-fused: RuntimeError shape '[3]'"
     )
+
+
+@needs_triton
+def test_each_variant_of_a_kernel_is_compiled_once_and_not_launched():
+    compiled, meanwhile, afterwards, message = interpreted(compiled_variants)
+    options = ((7,), 8, 3)
+    assert compiled == [(False, 3, *options), (True, 3, *options), (True, 4, *options)]
+    assert (meanwhile, afterwards) == (0, 4)
+    assert message == "does not compile"
 
 
 @needs_triton

@@ -8,6 +8,8 @@ next layer. The table of `FusedLayout` ties the weights: the gradient of W is th
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -16,12 +18,14 @@ from jumper_warp.rl.flat import ALIGNMENT, FlatParameters, Segment, aligned
 from jumper_warp.rl.fused import kernels
 from jumper_warp.rl.mirror import MirrorMap, Symmetry
 from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.utils.threads import available_threads
 
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
 SPLITS = 64  # Number of splits of the samples whose sums are added in a fixed order; a power of two
 MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
+_noted: list[tuple[Any, tuple, dict[str, Any]]] | None = None  # Kernels to compile, with arguments and options
 
 
 class Layer(NamedTuple):
@@ -222,5 +226,35 @@ def rows_per_split(rows: int) -> int:
 
 
 def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 3) -> Launch:
-    """Return a function that launches a Triton kernel on a grid; its arguments are the kernel's."""
-    return lambda *args: kernel[grid](*args, num_warps=num_warps, num_stages=num_stages)
+    """Return a function that launches a Triton kernel on a grid; its arguments are the kernel's.
+
+    Within `compile_side_by_side` the function launches nothing, but notes the kernel.
+    """
+    options = {"num_warps": num_warps, "num_stages": num_stages}
+    if (noted := _noted) is None:
+        return lambda *args: kernel[grid](*args, **options)
+    return lambda *args: noted.append((kernel, args, options | {"grid": grid}))
+
+
+def compile_side_by_side(launches: Callable[[], object], device: torch.device) -> None:
+    """Compile the kernels that a procedure launches, in several threads, without launching them.
+
+    Errors of the compiler propagate.
+    """
+    global _noted
+    _noted = []
+    try:
+        launches()
+        variants = {(kernel, *map(_variant, args)): (kernel, args, options) for kernel, args, options in _noted}
+    finally:
+        _noted = None
+    set_device = partial(torch.cuda.set_device, device) if device.type == "cuda" else None
+    with ThreadPoolExecutor(available_threads(), initializer=set_device) as pool:
+        jobs = [pool.submit(kernel.warmup, *args, **options) for kernel, args, options in variants.values()]
+        for job in jobs:
+            job.result()
+
+
+def _variant(argument: Any) -> Any:
+    """Return what Triton compiles a kernel for: the type of a tensor's entries, the value of another argument."""
+    return argument.dtype if isinstance(argument, torch.Tensor) else argument

@@ -11,7 +11,7 @@ from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.flat import FlatAdam
 from jumper_warp.rl.fused import kernels
 from jumper_warp.rl.fused.collector import FusedCollector
-from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, launch, rows_per_split
+from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
@@ -168,7 +168,13 @@ class FusedUpdate:
 
     @torch.no_grad()
     def warm_up(self) -> None:
-        """Compile all kernels by running them once; changes parameters, optimiser, rollout, counts and statistics."""
+        """Compile all kernels and run them once; changes parameters, optimiser, rollout, counts and statistics."""
+        if self._side_stream is not None:
+            compile_side_by_side(self._launch_all, self._flat.value.device)
+        self._launch_all()
+
+    def _launch_all(self) -> None:
+        """Launch every kernel of rollout and update once."""
         self._collector.act(0)
         self._collector.record(0)
         self._fused.critic.forward(self._critic_features, self._rows)
