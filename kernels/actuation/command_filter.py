@@ -1,4 +1,4 @@
-"""Motor command filter (paper, Section III): position targets are limited near the joint limits.
+"""Motor command filter (Olsen et al., Section III): clamps targets to limits, more firmly the sooner these are reached.
 
 A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
 m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
@@ -28,7 +28,7 @@ COMMAND_BOUND = wp.constant(real(12.566370614359172))
 
 @wp.struct
 class Limits:
-    """Limits of a motor angle or sum of angles, and widths of the hard zones inside them (0: none)."""
+    """Limits of a motor angle or sum of angles, and widths of hard zones inside them, which ignore speed (0: none)."""
 
     lower: real  # [rad]
     upper: real  # [rad]
@@ -38,7 +38,7 @@ class Limits:
 
 @wp.struct
 class FilterParams:
-    """Limits, horizon and speed floor of the motor command filter, the same for all legs and worlds."""
+    """Constants of the motor command filter, the same for all legs: angle limits, time horizon, least assumed speed."""
 
     lateral: Limits
     transversal: Limits  # outer and inner alike
@@ -49,7 +49,7 @@ class FilterParams:
 
 @wp.func
 def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the weight [1] with which the command filter enforces a quantity's limits, from 0 (not) to 1 (fully).
+    """Return how strongly the filter enforces the limits of a motor angle or sum of angles, from 0 (not) to 1 (fully).
 
     See the module for the rules. command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor
     [rad/s]: see `FilterParams`.

@@ -1,4 +1,4 @@
-"""Passive forces in motor space: friction, damping and pressed hard stops, implicit in the end-of-step rates.
+"""Passive forces of a leg in motor space, implicit in time: friction, damping and the hard stops that it presses.
 
 Each force is linear in the rates after the step, tau = b - C q'(t + dt), so that it adds dt C to the inertia and
 b - C q'(t) to the torque: stiff stops stay stable at any step size.
@@ -40,7 +40,7 @@ class JointForces:
 
 @wp.func
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
-    """Return damping coefficients [N m s/rad] that stand for a leg's motor damping and friction at `rates` [rad/s]."""
+    """Return damping coefficients [N m s/rad] equivalent to a leg's motor damping and friction at `rates` [rad/s]."""
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
         p.damping[1] + p.friction[1] / wp.max(wp.abs(rates[1]), FRICTION_SPEED),
@@ -50,7 +50,7 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return a damping coefficient [N m s/rad], reduced to at most the torque `limit` [N m] at `rate` [rad/s]."""
+    """Return a damping coefficient [N m s/rad], reduced if its torque at `rate` [rad/s] would exceed `limit` [N m]."""
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 

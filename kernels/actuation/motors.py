@@ -8,7 +8,7 @@ from ..scalar import real
 
 @wp.struct
 class MotorParams:
-    """Gains, torque limits, speeds and sensor offset of one motor, at the joint (behind the gear)."""
+    """Gains, torque limits, speeds where torque drops, and sensor offset of a motor, at the joint (behind the gear)."""
 
     kp: real  # [N m/rad]
     kd: real  # [N m s/rad]

@@ -1,4 +1,4 @@
-"""Passive forces that general solvers lack, as explicit torques: capped knee damping, stops of angle sums, springs.
+"""Explicit passive torques for Newton's SolverMuJoCo: capped knee damping, stops of outer + inner angle, springs.
 
 `SolverJumper` includes them, damping and stops implicitly (`joint_forces`, `stops`, `springs`).
 """
@@ -44,9 +44,9 @@ def passive_torque_kernel(
     # in, out
     joint_f: wp.array(dtype=real),
 ):
-    """Compute the passive torques [N m] of every leg: knee damping, hard stops of angle sums, and springs.
+    """Apply every leg's passive torques [N m] to joint_f: knee damping, hard stops of outer + inner angle, and springs.
 
-    Those of the knees are written to joint_f, the others added; one thread per (world, leg). knee_damping [N m s/rad]
+    Those of the knees replace its entries, the others are added; one thread per (world, leg). knee_damping [N m s/rad]
     acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of outer + inner angle; stop_ke [N m/rad], stop_kd
     [N m s/rad] must be soft enough for explicit integration. springs (num_worlds,): stiffness [N/m] and rest length
     [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.

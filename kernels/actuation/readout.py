@@ -15,7 +15,7 @@ def motor_values_kernel(
     # out
     motor_values: wp.array2d(dtype=float),
 ):
-    """Copy the motors' values from an array of all joints (38 num_worlds,) to (12, num_worlds), the launch shape."""
+    """Copy the motors' values from an array of all joints (38 num_worlds,) to (12, num_worlds); a thread per motor."""
     motor, world = wp.tid()
     motor_values[motor, world] = joint_values[DOFS * world + 6 + motor_slot(motor)]
 
@@ -30,7 +30,7 @@ def paw_force_kernel(
     peak_force: wp.array(dtype=float),
     peak_paw_force: wp.array2d(dtype=float),
 ):
-    """Copy the paws' contact forces [N] to shape (4, num_worlds) and update their largest values; one thread per world.
+    """Copy the paws' contact forces [N] to shape (4, num_worlds) and update their peaks over time; thread per world.
 
     total_force (4 num_worlds,): a contact sensor's, paws FL, FR, BL, BR of each world. peak_paw_force (4, num_worlds)
     is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 discards earlier peaks.

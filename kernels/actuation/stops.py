@@ -105,7 +105,7 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return which stop of angle i (lateral, outer, inner, sum) the set holds: 0 (none), LOWER_STOP or UPPER_STOP."""
+    """Return which stop of angle i (lateral, outer, inner, sum) is pressed: 0 (none), LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
@@ -130,7 +130,7 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the set of pressed hard stops with which to solve a leg's step next, after `sets` sets were tried.
+    """Return which hard stops of a leg to assume pressed in the next solution of a step, after `sets` solutions.
 
     The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s].
     """
@@ -146,7 +146,7 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether only one hard stop per world may change in the next set of stops, after `sets` sets were tried."""
+    """Return whether only one hard stop per world may change in the next solution of a step, after `sets` of them."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 

@@ -71,7 +71,7 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
-    """Return the distance [m] between two rounded shapes from that of their axes or boxes, at most `bound` [m].
+    """Return the distance [m] of two rounded shapes, at most `bound` [m], from the squared one of their axes or boxes.
 
     It is min(sqrt(distance_sq [m^2]) - radius, bound); radius: of both shapes together, bound >= 0.
     """

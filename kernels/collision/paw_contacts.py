@@ -23,7 +23,7 @@ class ContactRows:
 
 @wp.struct
 class PawShapes:
-    """Indices of the shapes of paws and ground in a model, and the model's arrays of all shapes."""
+    """Indices of the shapes of paws and ground in a model, and body, transform and scale of all shapes."""
 
     paws: wp.array(dtype=int)  # (4 num_worlds,) shape index, FL, FR, BL, BR of each world
     ground: int  # shape index

@@ -1,4 +1,4 @@
-"""Forbidden contacts of a robot: links with the ground, with other legs, with their own leg and with the shell.
+"""Detection of a robot's forbidden contacts: of links or body shell with the ground, and of links with links or shell.
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
@@ -155,7 +155,7 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
 
 @wp.func
 def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] of a leg from the shell without the motor drums at its end, at most `bound` (>= 0)."""
+    """Return the distance [m] of a leg from the shell without the motor drums at its end of the body, up to `bound`."""
     drums = wp.where(capsules.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))
@@ -229,7 +229,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 @wp.func
 def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
-    """Return `collisions` with one more distance [m] included: the clearance, and bit `flag` if it is < least [m]."""
+    """Return `collisions` with clearance reduced to `distance` [m] if that is less, and `flag` set if it is < least."""
     result = Collisions()
     result.flags = collisions.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(collisions.clearance, distance)
@@ -276,7 +276,7 @@ def add_leg_distances(
 def world_collisions(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, margin: real
 ) -> Collisions:
-    """Return the forbidden contacts of one robot and its smallest distance [m], at most `margin`.
+    """Return the forbidden contacts of one robot and the smallest distance [m] of all checked pairs, at most `margin`.
 
     geometry: the four legs. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
     quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are

@@ -1,4 +1,4 @@
-"""Solution of the equations of motion, an arrow-shaped system: eliminate legs, solve six base equations, substitute.
+"""Solution of the equations of motion, a block arrowhead system: eliminate legs, solve for the base, substitute back.
 
 Equations and symbols (D, Bv, Bw, tau, h): see `leg_dynamics`. All vectors are in body axes.
 """

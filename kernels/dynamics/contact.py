@@ -97,9 +97,9 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Compute how the velocity of a paw's contact responds to impulses on it, through the leg and the base.
+    """Return `contact` with its velocity's responses to impulses on the paw, through the leg and the base, filled in.
 
-    Returns the contact with `from_lin` to `total` set; point [m]: point of contact from the base origin, body axes.
+    These are the fields `from_lin` to `total`; point [m]: point of contact from the base origin, body axes.
     """
     c = contact
     eye = wp.identity(n=3, dtype=real)
@@ -161,7 +161,7 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 
 @wp.func
 def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
-    """Return the sum of the paws' impulses [N s] on the sliding block; contacts: the (4,) of a world."""
+    """Return the paws' total impulse [N s] on a world's sliding block (a movable box on the floor), body axes."""
     push = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         if contacts[k].on_block != 0:
@@ -186,9 +186,9 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Return a paw's contact with the sliding block, which also moves under the paw's impulse.
+    """Return `contact` as one with the sliding block, which also moves under the paw's impulse.
 
-    `on_block` is 1, and `total` includes the response.
+    `on_block` is set to 1, and the block's response is added to `total`.
     """
     c = contact
     c.on_block = 1

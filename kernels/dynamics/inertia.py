@@ -11,7 +11,7 @@ from ..scalar import mat33, real, vec2, vec3, vec5, vec6
 
 @wp.struct
 class MassMoments:
-    """Mass, first and second moments of mass of one or more links; the user states the point and the axes."""
+    """Mass, first and second moments of mass of one or more links, about a point and in axes that each use states."""
 
     mass: real  # [kg]
     first: vec3  # [kg m]

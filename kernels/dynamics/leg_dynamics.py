@@ -1,4 +1,4 @@
-"""Dynamics of one leg in the base's equations: inertia, couplings to the base, and velocity-product forces.
+"""Terms of one leg in the equations of motion: inertia, couplings to the base, and bias (velocity, gravity) forces.
 
 With the base's linear acceleration a (of its origin), angular one alpha, and motor accelerations q'' and torques tau:
 
@@ -102,7 +102,7 @@ def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
 
 @wp.func
 def centrifugal(second_j: vec5, w: vec3) -> real:
-    """Return the centrifugal torque [N m] on a motor (outer or inner) from the rotation of its leg's housing.
+    """Return the centrifugal torque [N m] on an outer or inner motor due to the angular velocity of its leg's housing.
 
     It is 1/2 w^T (dI/dq_j) w. second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the housing,
     housing axes.

@@ -17,7 +17,7 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 
 @wp.struct
 class LinkSums:
-    """Mass integrals over moving links of a leg, which give its inertia, couplings to the base and bias forces.
+    """Integrals over the mass of moving links of a leg, which give its inertia, couplings to the base and bias forces.
 
     Subscripts o and i: derivatives w.r.t. the outer and inner motor angle. In the sums of one side of the leg, o is the
     motor of that side and i the other motor; `leg_sums` reorders them.
@@ -174,7 +174,7 @@ def add_thigh(
 
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of the outer thigh and shank together; o: outer motor, i: inner motor."""
+    """Return the mass integrals of outer thigh and shank together; subscripts: o is the outer motor, i the inner."""
     sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
     shank_part = shank_sums(
@@ -187,7 +187,7 @@ def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of the inner thigh and shank together; o: inner motor, i: outer motor."""
+    """Return the mass integrals of inner thigh and shank together; subscripts: o is the inner motor, i the outer."""
     sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
     shank_part = shank_sums(
@@ -200,7 +200,10 @@ def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
-    """Return the mass integrals of a whole leg (o: outer, i: inner motor); the housing is at rest in its own frame."""
+    """Return the mass integrals of a whole leg; subscripts: o is the outer motor, i the inner.
+
+    The housing, at rest in its own frame, has only mass and moments.
+    """
     c = LinkSums()
     c.mass = housing.mass + outer.mass + inner.mass
     c.first = housing.first + outer.first + inner.first

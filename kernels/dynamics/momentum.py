@@ -1,4 +1,4 @@
-"""Momentum of a robot in free flight, and its correction to the conserved value.
+"""Momentum of a robot, and correction of its base's velocity in free flight that restores the exact momentum.
 
 Semi-implicit Euler has a first-order drift of momentum while legs move. In free flight, with no paw down and no
 external wrench, the exact momentum is known: angular momentum about the centre of mass is constant, linear momentum

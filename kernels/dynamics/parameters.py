@@ -109,7 +109,7 @@ def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float,
 
 @wp.func
 def body_row(body: int) -> int:
-    """Return the first row that a body's mass moments have in the parameter table; body: 0 (base) to 20."""
+    """Return the row of the parameter table where a body's mass moments begin; body: 0 (base) to 20."""
     if body == 0:
         return layout.BASE
     return ((body - 1) // layout.LEG_BODIES) * layout.LEG_ROWS + ((body - 1) % layout.LEG_BODIES) * layout.MOMENT_ROWS
@@ -258,7 +258,7 @@ def pack_springs_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write every leg's springs (stiffness [N/m], length [m]) to the parameter table; one thread per (world, leg)."""
+    """Write every leg's spring (stiffness [N/m], rest length [m]) to the parameter table; thread per (world, leg)."""
     world, leg = wp.tid()
     for j in range(2):
         table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])

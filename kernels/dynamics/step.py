@@ -64,7 +64,7 @@ class LegParams:
 
 @wp.struct
 class LegTerms:
-    """Contribution of one leg to a step's equations of motion: dynamics, eliminated motors, paw kinematics."""
+    """Contribution of one leg to a step's equations of motion: dynamics, solution for its motors, paw kinematics."""
 
     dynamics: LegDynamics
     solve: LegSolve
@@ -86,7 +86,7 @@ def leg_terms(
     params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return a leg's contribution to a step's equations of motion: dynamics, eliminated motors, paw kinematics.
+    """Return a leg's contribution to a step's equations of motion: dynamics, solution for its motors, paw kinematics.
 
     In body axes; passive forces and pressed stops are included. angles [rad], rates [rad/s], torque [N m] of the
     motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: of the base, body axes.

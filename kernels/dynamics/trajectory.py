@@ -1,4 +1,4 @@
-"""Data of rollouts shared by their kernels: commands, trajectory rows, latency and command filter."""
+"""Inputs and recorded trajectories of rollouts, and functions for their latency, motors and command filter."""
 
 import warp as wp
 
@@ -146,7 +146,7 @@ def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
 
 @wp.func
 def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParams:
-    """Return gains, limits, sensor offset and over-speed fade of motor 0 to 11 of a world."""
+    """Return all constants of motor 0 to 11 of a world, including the speeds of its over-speed protection."""
     params = load_motor(actuation.motors, motor, world)
     params.fade_start = actuation.fade[0, world]
     params.fade_end = actuation.fade[1, world]
@@ -185,7 +185,7 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 def policy_target(
     filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
 ) -> real:
-    """Return the target [rad] of motor 0 to 11 after the command filter in policy step `step`; -1: initial target."""
+    """Return the filtered target [rad] of motor 0 to 11 in policy step `step`, or the initial target if step < 0."""
     if step < 0:
         return initial_target[motor, world]
     return filtered_target[step, motor, world]

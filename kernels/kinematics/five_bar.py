@@ -51,10 +51,9 @@ class FiveBarBias:
 
 @wp.func
 def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
-    """Return the rate about +y [rad/s] of a link of the five-bar, from the velocity [m/s] of its far end.
+    """Return a five-bar link's rate about +y [rad/s] from the velocity [m/s] of its far end relative to its near end.
 
-    velocity: relative to the link's near end. direction: unit vector (x, z) from the near end to the far end; length
-    [m]. Accelerations give [rad/s^2] likewise.
+    direction: unit vector (x, z) from the near end to the far end; length [m]. Accelerations give [rad/s^2] likewise.
     """
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 

@@ -1,4 +1,4 @@
-"""Geometry of one leg, the argument of most kernels of the physics."""
+"""Geometric constants of one leg, which most physics kernels take as an argument."""
 
 import warp as wp
 

@@ -97,7 +97,7 @@ def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
 
 @wp.func
 def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> vec3:
-    """Return the closed-form motor angles [rad] for an ankle target [m], clamped to limits; a guess if out of reach.
+    """Return closed-form motor angles [rad] for an ankle target [m], clamped to limits; if out of reach, a first guess.
 
     target: from the hip, body axes.
     """
@@ -133,9 +133,9 @@ def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
 
 @wp.func
 def nearest_reachable(geo: LegGeometry, limits: LegLimits, target: vec3, guess: vec2) -> vec3:
-    """Return the reachable ankle position nearest to `target`, both [m] relative to the hip, body axes.
+    """Search for the reachable ankle position nearest to `target`, and return it; both [m] from the hip, body axes.
 
-    guess: (outer, inner) [rad] within limits. The search is over thigh angles; see the module docstring.
+    guess: first candidate (outer, inner) [rad] within limits. The search is over thigh angles; see the module.
     """
     directions = 9  # a variable: a loop over a constant would be unrolled
     best = vec2(guess[0], guess[1])

@@ -52,7 +52,7 @@ def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> m
 
 @wp.func
 def damped_ratio(speed: real, lever: real) -> real:
-    """Return a thigh's rate [rad/s] for an ankle speed along its shank, damped where both links are nearly aligned.
+    """Return a thigh's rate [rad/s] for an ankle speed along the shank, damped where thigh and shank nearly align.
 
     It is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s]: of the ankle along the
     shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is below LEVER_FLOOR where thigh and shank

@@ -31,5 +31,5 @@ _ADJOINT = "adj_x += adj_ret[0] * wp::cos(x) - adj_ret[1] * wp::sin(x);"
 
 @wp.func_native(_SNIPPET, _ADJOINT)
 def sin_cos(x: real) -> vec2:
-    """Return (sine, cosine) of an angle [rad]; kernels run `_SNIPPET` instead of this body."""
+    """Return (sine, cosine) of an angle [rad]; kernels run the C++ code `_SNIPPET` instead of this Python body."""
     return vec2(wp.sin(x), wp.cos(x))

@@ -59,7 +59,7 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the constants for differentiating the base's virtual power: multipliers, accelerations, end velocities.
+    """Return the values held constant while the base's virtual power is differentiated: adjoint multipliers and motion.
 
     The step takes dt [s], from state `base` to `end`. virtual_*: adjoint multipliers, body axes.
     """
@@ -78,7 +78,7 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return the constants for differentiating a leg's virtual power: multipliers, motor motion, contact impulse.
+    """Return the values held constant while a leg's virtual power is differentiated: multipliers, motion, contact.
 
     rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s].
     """

@@ -80,7 +80,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Add the gradient w.r.t. a motor's interpolated target, split by weight, to those of the two policy targets."""
+    """Add the gradient w.r.t. a motor's interpolated target, by weight, to those w.r.t. the two targets around it."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)

@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """Physics step that a GPU thread differentiates: index in the rollout, entry in the record, weight in the sum."""
+    """Physics step that a GPU thread differentiates: index in the rollout, `LegRecord` entry, weight in the sum."""
 
     step: int  # of the rollout
     entry: int  # of the record
@@ -31,7 +31,7 @@ class SpanStep:
 
 @wp.func
 def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
-    """Return how many physics steps each of a leg's `threads_per_leg` threads takes for a range of trajectory rows."""
+    """Return how many physics steps of a range of trajectory rows each of a leg's `threads_per_leg` threads handles."""
     return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 

@@ -63,7 +63,7 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return the settings with which a thread adds its gradients to `gradients.parameters`, with weight 1."""
+    """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -178,7 +178,7 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 
 @wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
-    """Convert the gradient w.r.t. the base's centre of mass to gradients w.r.t. mass and first moment, and add these.
+    """Add the gradient w.r.t. the base's centre of mass to those w.r.t. its mass and first moment, by the chain rule.
 
     gradient: w.r.t. com [m]. mass [kg]: of the base, its first moment is mass * com.
     """
@@ -188,7 +188,7 @@ def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add a motor's gradient w.r.t. its constants, times `scale`, to a world's parameter gradient.
+    """Add the gradient w.r.t. the constants of a motor, times `scale`, to a world's parameter gradient.
 
     p: that gradient; fade_start and fade_end, common to all motors, go to `shared`, the others to `sums`.
     """
@@ -206,7 +206,7 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient w.r.t. the command filter's limits of one angle or sum; that w.r.t. its hard zones is 0."""
+    """Add the gradient w.r.t. the command filter's limits of one angle or sum to `sums`; that of hard zones is 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 

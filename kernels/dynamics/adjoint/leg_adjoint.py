@@ -154,7 +154,7 @@ def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, le
 
 @wp.func
 def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) -> mat33:
-    """Return a 3x3 block of this thread's matrix row after one step of block Gauss-Jordan elimination, with row j.
+    """Return a 3x3 block of this thread's matrix row after a step of block Gauss-Jordan elimination, with pivot row j.
 
     factor: this row's block in column j. pivot: in thread j, the block of row j scaled by the inverse diagonal block.
     """
@@ -213,7 +213,7 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return the constants for differentiating the base's virtual power in a recorded step: multipliers and motion.
+    """Return the values held constant while the base's virtual power in a recorded step is differentiated.
 
     i: entry of the step, of dt [s], in the record; base: state at its start.
     """
@@ -225,7 +225,7 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return the constants for differentiating a leg's virtual power in a recorded step: multipliers, motion, contact.
+    """Return the values held constant while a leg's virtual power in a recorded step is differentiated.
 
     step: its number in the rollout; dt [s]; i: its entry in the record.
     """
@@ -240,7 +240,7 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Adjoint multipliers of a step's motion and contact equations, and gradients w.r.t. the velocities before it."""
+    """Adjoint multipliers of a step's motion equations and contact laws, and gradients w.r.t. its start velocities."""
 
     base: BaseWeights
     leg: LegWeights
@@ -350,7 +350,7 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add the gradient of a step w.r.t. all constants of a leg, friction coefficients included, to `sums`."""
+    """Add a step's gradient of the loss w.r.t. all constants of a leg, friction coefficients included, to `sums`."""
     add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))

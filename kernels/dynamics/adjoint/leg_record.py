@@ -189,7 +189,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return from the record a leg's motor accelerations as a function of the base's acceleration, with `free` 0."""
+    """Return recorded matrices of a leg's motor accelerations as a function of the base's; its offset `free` is 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -199,7 +199,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Write a leg's motor accelerations as a function of the base's acceleration to the record, without `free`."""
+    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`."""
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
@@ -225,7 +225,7 @@ def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: Moto
 
 @wp.func
 def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
-    """Return a paw's recorded contact law; all fields but `mode` are 0 where it is SEPARATE."""
+    """Return a paw's recorded contact law; for a paw without contact (mode SEPARATE), all fields but `mode` are 0."""
     law = LegLaw()
     law.mode = int(record.legs[entry, MODE, world, leg])
     if law.mode != SEPARATE:
@@ -242,7 +242,7 @@ def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
 
 @wp.func
 def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
-    """Write a paw's contact law to the record; only `mode` where it is SEPARATE."""
+    """Write a paw's contact law to the record; for a paw without contact (mode SEPARATE), only `mode`."""
     record.legs[entry, MODE, world, leg] = real(law.mode)
     if law.mode != SEPARATE:
         record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)

@@ -231,10 +231,10 @@ def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write each paw's contact, linearised contact law and gradient w.r.t. its impulse to `legs`.
+    """Write each paw's contact, contact law and gradient w.r.t. its impulse to `legs`; return whether any paw touches.
 
-    Returns whether any paw touches. m: from `solve_system`. first_impulse: as `Commands.impulse`. cotangent: gradient
-    w.r.t. the trajectory.
+    The laws are linearised at the step's solution. m: from `solve_system`. first_impulse: as `Commands.impulse`.
+    cotangent: gradient w.r.t. the trajectory.
     """
     world, i = at.world, at.entry
     base = record.base[world, i]
@@ -318,7 +318,7 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the constants for differentiating the base's virtual power in the step `at`: multipliers and motion.
+    """Return the values held constant while the base's virtual power in the step `at` is differentiated.
 
     m: from `find_multipliers`.
     """
@@ -331,7 +331,7 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return the constants for differentiating a leg's virtual power in the step `at`: multipliers, motion, impulse.
+    """Return the values held constant while a leg's virtual power in the step `at` is differentiated.
 
     k: leg 0 to 3. Needs the results of `find_multipliers`.
     """

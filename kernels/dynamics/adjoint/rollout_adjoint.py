@@ -197,7 +197,7 @@ def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients of the loss w.r.t. a motor's target, constants, angle and rate, through its torque in a step.
+    """Backpropagate through a motor's torque in a step, and add the gradients to `legs`, `sums` and `gradients`.
 
     motor: 0 to 11. `legs[k].torque` and cotangent.torque are the gradient w.r.t. the torque; angle and rate go to
     `legs`, constants to `sums`, targets to `gradients`.
@@ -222,7 +222,11 @@ def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients w.r.t. targets, constants, angles and rates through leg k's command filter in policy step t."""
+    """Store the gradient w.r.t. leg k's targets in policy step t, and add those w.r.t. other inputs of its filter.
+
+    by_filter: these gradients. Those w.r.t. targets are stored in `gradients`, those w.r.t. angles and rates are added
+    to `legs`, and those w.r.t. filter constants and sensor offsets to `sums`.
+    """
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
     command_adjoint.add_offsets(sums, k, by_filter.angles)
     add_filter(sums, by_filter.constants)
@@ -326,9 +330,9 @@ def adjoint_roots(
     factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
     trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Call every function that the reverse pass differentiates, so that Warp generates all of their adjoints.
+    """Call all functions that the reverse pass differentiates, so that Warp generates their adjoints; return a dummy.
 
-    Returns a sum of the results, which has no meaning; see `generate_adjoints`.
+    It is the sum of the results, which has no meaning; see `generate_adjoints`.
     """
     params = load_leg(model, world, 0)
     v = row_vec3(trajectory.q, 0, 0, world)
@@ -352,10 +356,10 @@ def adjoint_roots(
 
 
 def generate_adjoints(module: str) -> wp.Kernel:
-    """Make Warp generate, in a module of kernels, the adjoints of all functions that the reverse pass differentiates.
+    """Return a kernel that makes Warp generate adjoints of all functions that the reverse pass differentiates.
 
-    module: its `__name__`. `wp.grad` alone omits adjoints of functions that were called elsewhere before; a kernel with
-    a backward pass, never launched, includes them all.
+    module: `__name__` of the module of kernels that needs them. `wp.grad` alone omits adjoints of functions that were
+    called elsewhere before; a kernel with a backward pass, never launched, includes them all.
     """
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))

@@ -45,7 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's index of the first physics step after a trajectory row; a row has `every` + 1 entries."""
+    """Return the record entry of the first physics step after a trajectory row; each row takes `every` + 1 entries."""
     return (row - span.begin) * (timing.every + 1)
 
 

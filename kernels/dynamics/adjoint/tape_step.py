@@ -1,4 +1,4 @@
-"""Differentiable time step for `wp.Tape`: one launch solves the step, and the tape records two more.
+"""Differentiable time step for `wp.Tape`: one kernel solves the step unrecorded, and the tape records two others.
 
     solve_kernel (not recorded) -> power_kernel -> integrate_kernel
 
@@ -96,7 +96,7 @@ def power_kernel(
     # out
     power: wp.array2d(dtype=real),
 ):
-    """Compute the virtual power of each leg in a step, so that the tape's gradient of it is the step's gradient.
+    """Compute each leg's virtual power in a step, which the tape differentiates in place of the solution of the step.
 
     power: (4, num_worlds), leg 0 with the base; one thread per (leg, world).
     """
@@ -130,7 +130,7 @@ def power_kernel(
 
 @wp.struct
 class EndVelocities:
-    """Velocities at the end of a step: of the base in the body axes of its start, and of the motors of each leg."""
+    """Velocities at the end of a step: of the base, in the body axes at its start, and of the motors of each leg."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]

@@ -1,4 +1,4 @@
-"""Virtual power of a step's equations of motion: one scalar whose partial derivatives the reverse pass adds up.
+"""Virtual power of a step: equations of motion times adjoint multipliers, which the reverse pass differentiates.
 
 A step solves M (v' - v) = dt f + J^T p for the new velocities v' (f: forces, p: contact impulses). For multipliers m,
 one per velocity, the scalar is
@@ -397,10 +397,10 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base's part of a step's virtual power, plus dot(`cotangent`, gravity and velocities in rotated axes).
+    """Return the base's part of a step's virtual power, plus dot products that backpropagate through changes of axes.
 
-    gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
-    axes; orientation: xyzw.
+    These are of `cotangent` with gravity and velocities, in the axes of `BaseCotangent`. gravity [m/s^2], external
+    force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body axes; orientation: xyzw.
     """
     g = wp.quat_rotate_inv(orientation, gravity)
     frame = FrameMotion()

@@ -59,9 +59,9 @@ def record_contacts(
     work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
     last: bool, legs: wp.array(dtype=LegStep),
 ):  # fmt: skip
-    """Write the paws' impulses [N s] and, if `last`, forces [N] to `work`, world axes, and update the peak values.
+    """Write the paws' impulses [N s] and, in the launch's last step, forces [N] to `work`, and update the peak values.
 
-    solved: statistics of the step dt [s]. The peak of each paw goes to `legs`, all other peaks to `work`.
+    World axes. solved: statistics of the step dt [s]. The peak of each paw goes to `legs`, all other peaks to `work`.
     """
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):

@@ -32,7 +32,7 @@ class LegStep:
 
 @wp.struct
 class StepSolution:
-    """Solution of a step: end velocities of the base, in the body axes of the start of the step, and statistics."""
+    """Solution of a step: end velocities of the base, in the body axes at its start, and statistics of iterations."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
