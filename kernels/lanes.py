@@ -87,7 +87,10 @@ def sum_legs(x: real) -> real:
 
 @wp.func_native(_STEP_THREADS)
 def sum_step_threads(x: real) -> real:
-    """Return the sum of x over the eight threads of a leg in a warp of (8 threads, 4 legs) of a world; x on a CPU."""
+    """Return the sum of x over the eight threads of one leg, in a GPU warp that simulates one world with 8 x 4 threads.
+
+    On a CPU it returns x.
+    """
     ...
 
 
@@ -163,13 +166,13 @@ def mat_from_leg(m: mat33, leg: int) -> mat33:
 
 @wp.func
 def sum_quat(q: quat) -> quat:
-    """Return the entrywise sum of a quaternion q over the four legs of a world, as for gradients; not normalised."""
+    """Return the sum of the components of a quaternion q over the four legs of a world, not normalised."""
     return quat(sum_legs(q[0]), sum_legs(q[1]), sum_legs(q[2]), sum_legs(q[3]))
 
 
 @wp.func
 def sum_symmetric(m: mat33) -> mat33:
-    """Return the sum of a symmetric matrix m over the four legs of a world: six sums, of the upper triangle."""
+    """Return the sum of a symmetric 3x3 matrix m over the four legs of a world; only its upper triangle is read."""
     xx, yy, zz = sum_legs(m[0, 0]), sum_legs(m[1, 1]), sum_legs(m[2, 2])
     xy, xz, yz = sum_legs(m[0, 1]), sum_legs(m[0, 2]), sum_legs(m[1, 2])
     return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
@@ -177,7 +180,7 @@ def sum_symmetric(m: mat33) -> mat33:
 
 @wp.func
 def sum_matrix(m: mat33) -> mat33:
-    """Return the sum of any 3x3 matrix m over the four legs of a world: nine sums."""
+    """Return the sum of a 3x3 matrix m, symmetric or not, over the four legs of a world."""
     return mat33(
         sum_legs(m[0, 0]), sum_legs(m[0, 1]), sum_legs(m[0, 2]),
         sum_legs(m[1, 0]), sum_legs(m[1, 1]), sum_legs(m[1, 2]),

@@ -13,7 +13,7 @@ from .scalar import quat, real, vec3
 
 @wp.struct
 class BaseState:
-    """Position, orientation, velocity and angular velocity of the base link's origin."""
+    """Pose of the base link, velocity of its origin (world axes), and angular velocity (body axes)."""
 
     pos: vec3  # [m], world
     quat: quat  # xyzw, body to world
@@ -59,13 +59,13 @@ def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), co
 
 @wp.func
 def load_motors(values: wp.array(dtype=real), first: int) -> vec3:
-    """Return a leg's three motor values (lateral, outer, inner) out of its five joint values, from `first` on."""
+    """Return a leg's motor values (lateral, outer, inner) out of its five joint values, which begin at `first`."""
     return vec3(values[first], values[first + 1], values[first + 3])
 
 
 @wp.func
 def store_motors(values: wp.array(dtype=real), first: int, motors: vec3):
-    """Write a leg's motor values (lateral, outer, inner) to its five joint values, from `first` on; knees are kept."""
+    """Write a leg's motor values (lateral, outer, inner) to its joint values, which begin at `first`, except knees."""
     values[first] = motors[0]
     values[first + 1] = motors[1]
     values[first + 3] = motors[2]

@@ -1,4 +1,4 @@
-"""Commands of the attitude task (goal orientations): sampled, or set by the host program."""
+"""Commands of the attitude task: goal orientations, sampled at random or set from Python (`Env.command`)."""
 
 import warp as wp
 
@@ -32,9 +32,9 @@ def sample_unit_quat(rng: RngStream) -> wp.quat:
 
 @wp.func
 def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
-    """Return the sampled axis of a commanded turn, a unit vector in body axes.
+    """Return a random unit vector, body axes: a body axis with `body_axis_probability`, else any direction.
 
-    It is +-x, +-y or +-z with `body_axis_probability`, else uniform over the sphere.
+    Body axes (+-x, +-y or +-z) and directions on the sphere are uniformly distributed.
     """
     sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
     if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < body_axis_probability:
@@ -56,9 +56,9 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 
 @wp.func
 def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Return the task state whose goal is the present orientation, rotated by `values`; zeros: no turn.
+    """Return the task state whose goal is the present orientation rotated by the quaternion `values` (xyzw, body axes).
 
-    values: quaternion xyzw of any length, body axes. scene and heading are unused (signature of `command.set`).
+    values: quaternion of any length; zeros: no rotation. scene and heading are unused (signature of `command.set`).
     """
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:

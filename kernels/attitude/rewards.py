@@ -21,13 +21,19 @@ def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
 
 @wp.func
 def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
-    """Reward for rest at the goal orientation: phi(angle; std [rad]) phi(angular speed; std_ang_vel [rad/s])."""
+    """Reward for rest at the goal orientation: product of Gaussians phi of the angle to it and of the angular speed.
+
+    std [rad], std_ang_vel [rad/s]: their widths.
+    """
     return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
 
 @wp.func
 def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_posture: float) -> float:
-    """Reward for the default pose at the goal orientation: phi(angle; std [rad]) phi(rms offset; std_posture [rad])."""
+    """Reward for the default pose at the goal orientation: product of Gaussians phi of angle and motor offset.
+
+    std [rad]: width for the angle to the goal orientation; std_posture [rad]: for the rms offset of all motors.
+    """
     return phi(state.error, std) * phi(posture_offset(robot, 0.0), std_posture)
 
 

@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base state of a sampling attempt: `start`, but in the last attempt with the default leg pose.
+    """Return a copy of `start` for one sampling attempt; in the last attempt its legs are in the default pose.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """
@@ -57,7 +57,10 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return default or sampled motor angles of leg `leg`, at rest; reachable if outer + inner is within its limits."""
+    """Return motor angles of leg `leg`, default or sampled, with rates 0.
+
+    Sampled ones are marked as reachable if the sum of outer and inner angle is within its limits.
+    """
     sample = LegSample()
     if base.default_legs:
         for j in range(3):

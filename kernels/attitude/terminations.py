@@ -8,7 +8,7 @@ from .state import AttitudeState
 
 @wp.func
 def ended_clear(robot: RobotView, state: AttitudeState) -> bool:
-    """Terminate an episode without collisions after `state.episode_steps` policy steps; never if that is 0."""
+    """Terminate after `state.episode_steps` (not 0) policy steps if there was no collision in the episode."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps and state.collisions == 0
 
 

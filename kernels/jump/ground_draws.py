@@ -1,4 +1,4 @@
-"""Sampled ground of an episode: level, a platform to jump off, or a block to jump onto, which may slide."""
+"""Sampling of the ground of an episode: level, with a platform to jump off, or with a block to jump onto."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] |x|, |y| of a paw from 
 
 @wp.struct
 class GroundRanges:
-    """Probabilities and ranges (lower, upper) of a platform to jump off and a block to jump onto in standing starts."""
+    """Probabilities and ranges (lower, upper) of a platform to jump off and of a block to jump onto."""
 
     platform: float  # probability of a platform under the start
     block: float  # probability of a block under the goal
@@ -57,9 +57,10 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 @wp.func
 def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a sampled platform under a robot at the origin, or no block if its paws would land on it at the goal.
+    """Return a platform of sampled size under the origin, or no block if the paws at the goal would be too near to it.
 
-    foot: half extents [m] of the paws (`footprint`); goal [m]: world axes.
+    The paws must be at least `ranges.clearance` away from the platform. foot: half extents [m] of the paws
+    (`footprint`); goal [m]: world axes.
     """
     half = foot + wp.vec2(
         uniform(rng, streams.PLATFORM_ROOM_X, MIN_EDGE_DISTANCE, ranges.room),
@@ -73,10 +74,11 @@ def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: w
 
 @wp.func
 def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a sampled block under the goal, or no block if its near side fits nowhere between start and goal paws.
+    """Return a sampled block under the goal, or no block if goal and start are too close for its near side.
 
-    The near side crosses the axis (x or y) along which the goal is farther. Beyond the nearest place its distance is
-    u^2 times the free length, u uniform in [0, 1): near blocks are frequent. foot, goal: as in `sample_platform`.
+    The near side lies between the paws at the start and those at the goal. It crosses the axis (x or y) along which the
+    goal is farther. Beyond the nearest place its distance is u^2 times the free length, u uniform in [0, 1): near
+    blocks are frequent. foot, goal: as in `sample_platform`.
     """
     along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)  # axis: 0 x, 1 y
     distance = wp.abs(goal[along])
@@ -99,7 +101,10 @@ def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.v
 
 @wp.func
 def sample_ground(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return the sampled block of a standing start: platform, block or none; foot, goal: as in `sample_platform`."""
+    """Return a platform under the start, a block under the goal, or no block, as sampled for a standing start.
+
+    foot, goal: as in `sample_platform`.
+    """
     u = uniform(rng, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
         return sample_platform(rng, ranges, foot, goal)

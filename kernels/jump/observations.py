@@ -43,7 +43,7 @@ def phase(robot: RobotView, state: JumpState) -> wp.vec3:
 
 @wp.func
 def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Times [s] in the current phase, at most 2, and since the command, clamped to -1..3."""
+    """Time since the phase of the jump began (at most 2 s) and time since the command (clamped to -1..3 s)."""
     return wp.vec2(
         wp.min(float(state.phase_steps), 120.0) / 60.0,
         wp.clamp(float(state.steps - state.command_step), -60.0, 180.0) / 60.0,
@@ -52,17 +52,20 @@ def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Height errors [m]: highest base height so far, and ballistic apex z + v_z^2 / 2g, less the commanded apex."""
+    """Errors [m] of the jump's highest base height so far and of the predicted apex, both less the commanded apex.
+
+    The predicted apex is the ballistic one, z + v_z^2 / 2g, or z if the base falls.
+    """
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
     return wp.vec2(state.max_height - state.goal[2], apex - state.goal[2])
 
 
 @wp.func
 def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Horizontal vector from the ballistic landing to the goal [m], ahead and to the left in the heading.
+    """Horizontal vector from the predicted landing to the goal [m], ahead and to the left in the base's heading.
 
-    The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
-    h, 0.3 m above the goal's ground.
+    The predicted landing is the ballistic one, p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the
+    base falls through h, 0.3 m above the goal's ground.
     """
     landing = estimated_landing(robot.pos, robot.lin_vel, LANDING_HEIGHT + state.goal_ground, robot.gravity_magnitude)
     miss = rotate_yaw(wp.vec3(state.goal[0] - landing[0], state.goal[1] - landing[1], 0.0), -yaw_of(robot.quat))
@@ -78,10 +81,11 @@ def way(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def span_of_ray(offset: float, half: float, direction: float) -> wp.vec2:
-    """Return the distances [m] at which a horizontal ray enters and leaves a slab normal to one world axis.
+    """Return the distances [m] at which a horizontal ray enters and leaves the space between two parallel walls.
 
-    offset [m]: slab's middle less ray's origin; half [m]: half width; direction: ray's component along the axis [1].
-    A ray parallel to the slab gives (-1e6, 1e6) inside it, (1e6, -1e6) outside.
+    The walls are normal to world x or y. offset [m]: their middle less the ray's origin, along that axis; half [m]:
+    half their distance; direction: the ray's component along the axis [1]. A ray parallel to the walls gives
+    (-1e6, 1e6) between them, (1e6, -1e6) outside.
     """
     if wp.abs(direction) < 1.0e-6:
         return wp.where(wp.abs(offset) <= half, wp.vec2(-1.0e6, 1.0e6), wp.vec2(1.0e6, -1.0e6))
@@ -107,10 +111,10 @@ def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -
 
 @wp.func
 def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
-    """Block ahead: entry and exit distance [m] along three rays, and the block's height above the floor [m].
+    """Distances [m] at which three rays ahead enter and leave the block, and the block's height above the floor [m].
 
-    The rays point along the base's heading, from 0.2 m to its left, the base, and 0.2 m to its right. A ray that misses
-    gives 2 m twice; the height is 0 without a block.
+    The rays are horizontal, along the base's heading, from 0.2 m to its left, the base, and 0.2 m to its right. A ray
+    that misses gives 2 m twice; the height is 0 without a block.
     """
     block = world_ground(ground, world).block
     pos = base_pos(arrays, world)

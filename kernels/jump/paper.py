@@ -1,4 +1,4 @@
-"""Reward (paper, Table IV) and termination terms of jumps in the paper's form, where the project's own terms differ.
+"""Reward and termination terms of jumps as in the paper (Table IV), where this project's own tasks use other ones.
 
 phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_*, scale_*: their widths, in the unit of their argument.
 The deceleration along the base's present velocity is the paper's; the stock terms use its velocity before the step.
@@ -15,7 +15,7 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset
 
 @wp.func
 def height_reward(error: float, std: float, scale: float) -> float:
-    """Return the reward for a height error [m] of a jump: Gaussian phi_std plus 3 times Laplacian psi_scale."""
+    """Return the reward for a height error [m]: Gaussian of width `std` plus 3 times Laplacian of width `scale` [m]."""
     return phi(error, std) + 3.0 * psi(error, scale)
 
 
@@ -50,10 +50,10 @@ def tracking(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def estimated_tracking(robot: RobotView, state: JumpState, std: float, std_wide: float, height: float) -> float:
-    """Reward for a ballistic landing of the base close to the goal, in flight: phi_std + 0.1 phi_wide of the error [m].
+    """Reward in flight for a predicted landing of the base close to the goal.
 
-    The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
-    h, `height` [m] above the goal's ground.
+    It is phi_std + 0.1 phi_wide of the distance [m]. The predicted landing is p_xy + t v_xy with
+    t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -70,7 +70,10 @@ def orientation_error(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def flight_orientation_error(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a level base in the jump's heading, in flight toward the goal: phi_std of squared error [rad^2]."""
+    """Reward for a level base with the jump's heading, in flight while the base moves toward the goal.
+
+    It is phi_std of the squared rotation error [rad^2].
+    """
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
     return orientation_error(robot, state, std)
@@ -78,9 +81,9 @@ def flight_orientation_error(robot: RobotView, state: JumpState, std: float) -> 
 
 @wp.func
 def landed_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Reward for motor angles near a pose after touchdown: default pose, transversal angles plus `shift` [rad].
+    """Reward after touchdown for motor angles near the default pose plus `shift` [rad] on transversal angles.
 
-    It is phi_std of the rms motor offset [rad].
+    It is phi_std of the rms motor offset [rad] from that pose.
     """
     if state.phase != LANDED:
         return 0.0
@@ -89,7 +92,7 @@ def landed_posture(robot: RobotView, state: JumpState, std: float, shift: float)
 
 @wp.func
 def impact_acceleration(robot: RobotView) -> float:
-    """Return the base's acceleration along its velocity [m/s^2], mean of the policy step; 0 if it speeds up."""
+    """Return minus the base's deceleration along its velocity [m/s^2], mean of the policy step; 0 if it speeds up."""
     return wp.min(wp.dot(robot.lin_acc, wp.normalize(robot.lin_vel)), 0.0)
 
 
@@ -103,7 +106,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
-    """Terminate if the base decelerates by more than `stance` [m/s^2] in stance, `flight` [m/s^2] in later phases."""
+    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases."""
     return impact_acceleration(robot) < -wp.where(state.phase == STANCE, stance, flight)
 
 

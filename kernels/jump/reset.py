@@ -1,6 +1,7 @@
-"""Reset of all jump tasks (`reset_jump`), and the next jump in an episode: start mode, goal, ground and command.
+"""Start of jumps: of the first one at a reset (`reset_jump`), and of further ones within an episode.
 
-`start_states` samples the state of the robot.
+They are functions of all jump tasks. They sample start mode, goal, ground and time of the command; `start_states`
+samples the state of the robot.
 """
 
 import warp as wp
@@ -51,9 +52,10 @@ class JumpLevel:
 
 @wp.func
 def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
-    """Return a goal [m] inside the box (lower, upper) moved horizontally toward the start into the inscribed ellipse.
+    """Return a goal [m] that is moved horizontally toward the start, so that the box of goals becomes an ellipse.
 
-    Each quadrant has its own half axes, since the box need not be centred on the start.
+    The ellipse is inscribed in the box (lower, upper). Each quadrant has its own half axes, since the box need not be
+    centred on the start.
     """
     x = goal[0] / wp.max(wp.where(goal[0] < 0.0, -lower[0], upper[0]), 1.0e-6)
     y = goal[1] / wp.max(wp.where(goal[1] < 0.0, -lower[1], upper[1]), 1.0e-6)
@@ -104,7 +106,7 @@ def begin_jump(
     rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
     next_jump_probability: float,
 ) -> JumpState:  # fmt: skip
-    """Return the task state of a new episode, whose jump phase and command step depend on its start mode.
+    """Return the task state of a new episode: phase of the jump and time of its command, according to the start mode.
 
     goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base.
     """
@@ -161,9 +163,9 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 @wp.func
 def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
-    """Sample the block of a world, or move it to its start position, and return the world's ground.
+    """Sample a new block for a world, or put the present one back to its start position; return the world's ground.
 
-    The block is moved if both probabilities of `grounds` are 0.
+    It is sampled if a probability of `grounds` is positive; only standing starts (STANDING, DEFAULT) get a block.
     """
     if grounds.platform + grounds.block > 0.0:
         block = Block()

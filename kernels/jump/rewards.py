@@ -19,7 +19,7 @@ REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which 
 
 @wp.func
 def waiting_weight(state: JumpState, waiting_scale: float) -> float:
-    """Return the factor on rewards that need no jump: `waiting_scale` while a commanded jump has not begun, else 1."""
+    """Return `waiting_scale` between command and takeoff, else 1: the factor on rewards for which no jump is needed."""
     return wp.where(waiting(state), waiting_scale, 1.0)
 
 
@@ -39,9 +39,9 @@ def should_rest(state: JumpState) -> bool:
 
 @wp.func
 def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Return a reward for a height close to the commanded one, largest at an error of 0 m.
+    """Return the reward for a height error [m]: sum of a fine Gaussian, 3 times a Laplacian, and a wide Gaussian.
 
-    It is phi_fine + 3 psi_sharp + phi_wide of the error, all [m]; phi_wide gives low jumps a gradient.
+    It is phi_fine + 3 psi_sharp + phi_wide of the error; phi_wide gives low jumps a gradient.
     """
     return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
@@ -112,9 +112,10 @@ def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_sca
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Reward for equal transversal and small lateral angles: phi(variance [rad^2]) phi(norm of lateral ones [rad]).
+    """Reward for equal transversal motor angles in all legs, and lateral angles close to 0.
 
-    From the command to the takeoff it is multiplied by `waiting_scale` [1].
+    It is phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad]). From the command to the
+    takeoff it is multiplied by `waiting_scale` [1].
     """
     total = float(0.0)
     total_sq = float(0.0)
@@ -132,9 +133,10 @@ def joint_symmetry(
 
 @wp.func
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
-    """Reward for motor angles near a pose, except in flight: default pose, transversal angles plus `shift` [rad].
+    """Reward in stance and after touchdown for motor angles near the default pose plus `shift` on transversal angles.
 
-    It is phi_std of the rms motor offset [rad], multiplied by `waiting_scale` [1] from the command to the takeoff.
+    It is phi_std of the rms motor offset [rad] from that pose, multiplied by `waiting_scale` [1] from the command to
+    the takeoff.
     """
     if state.phase == FLIGHT:
         return 0.0
@@ -151,9 +153,10 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Reward for retracting the legs after landing, to the default pose plus `shift` [rad], for 0.3 s.
+    """Reward for motor angles near the retracted pose in the 0.3 s after touchdown.
 
-    It is phi_std of the rms motor offset [rad] from that pose.
+    The pose is the default one, its transversal angles shifted by `shift` [rad]. The reward is phi_std of the rms motor
+    offset [rad] from that pose.
     """
     if not just_landed(state):
         return 0.0
@@ -162,7 +165,10 @@ def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: 
 
 @wp.func
 def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
-    """Reward for a base close to the goal after takeoff. It is phi_wide + fine_weight phi_fine of the distance [m]."""
+    """Reward for a base close to the goal after takeoff, horizontally.
+
+    It is phi_wide + fine_weight phi_fine of the distance [m].
+    """
     if state.phase == STANCE:
         return 0.0
     error = wp.length(goal_offset(robot, state))
@@ -186,7 +192,10 @@ def estimated_tracking(
 
 @wp.func
 def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a level base in the jump's heading, in flight toward the goal: phi_std of the angle [rad] from it."""
+    """Reward for a level base with the jump's heading, in flight while the base moves toward the goal.
+
+    It is phi_std of the rotation angle [rad] from that orientation.
+    """
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
     return phi(angle_from_level(robot.quat, state.heading), std)
@@ -216,9 +225,10 @@ def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_
 
 @wp.func
 def standing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Reward for a standing pose while the robot should rest: default pose, transversal angles plus `shift` [rad].
+    """Reward for motor angles near the standing pose while the robot should rest.
 
-    It is phi_std of the rms motor offset [rad].
+    The pose is the default one, its transversal angles shifted by `shift` [rad]. The reward is phi_std of the rms motor
+    offset [rad].
     """
     if not should_rest(state):
         return 0.0
@@ -251,9 +261,9 @@ def catch_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def damp_landing(robot: RobotView, state: JumpState) -> float:
-    """Reward for folding the legs, for 0.3 s from touchdown.
+    """Reward for legs that fold in the 0.3 s after touchdown: mean rate [rad/s] of the transversal motors.
 
-    It is the mean over transversal motors of the rate [rad/s], clamped to 0..1.
+    Each rate is clamped to 0..1.
     """
     if not just_landed(state):
         return 0.0
@@ -266,7 +276,10 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
-    """Reward for a motionless base while the robot should rest. It is phi(speed [m/s]) phi(angular speed [rad/s])."""
+    """Reward for a motionless base while the robot should rest.
+
+    It is phi(speed [m/s]) times phi(angular speed [rad/s]).
+    """
     if not should_rest(state):
         return 0.0
     return phi(wp.length(robot.lin_vel), std_lin_vel) * phi(wp.length(robot.ang_vel), std_ang_vel)
@@ -297,10 +310,7 @@ def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
-    """Penalty of paws that leave the ground again after landing.
-
-    It is their number, 0 to 4; they count after `threshold` [s] in the air.
-    """
+    """Penalty of paws that leave the ground again after landing: number in the air for more than `threshold` [s]."""
     count = float(0.0)
     if state.phase == LANDED:
         for k in range(4):
@@ -319,10 +329,10 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for keeping the capture point close to the middle of the paws after touchdown.
+    """Reward after touchdown for a capture point (where an inverted pendulum stops) near the middle of the paws.
 
-    It is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), where an inverted pendulum
-    with the base's position p, velocity v and height h stops.
+    It is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), with the base's position p,
+    velocity v and height h.
     """
     if state.phase != LANDED:
         return 0.0
@@ -353,7 +363,10 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
-    """Penalty of varying paw forces while the robot should rest: sum of ((peak - last force) / weight_force [N])^2."""
+    """Penalty of paw forces that vary within a policy step while the robot should rest.
+
+    It is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2.
+    """
     if not should_rest(state):
         return 0.0
     excess = robot.peak_force - robot.paw_force

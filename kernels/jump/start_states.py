@@ -33,7 +33,10 @@ PUSHING = wp.constant(5)  # in stance, accelerating toward takeoff
 
 @wp.struct
 class ResetRanges:
-    """Ranges of sampled start states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: -w to w."""
+    """Ranges from which start states of jumps are sampled; pairs are (lower, upper), angles [rad], lengths [m].
+
+    A half width w means the range from -w to w.
+    """
 
     start_probability: vec_start_modes  # of STANDING, DEFAULT, IN_FLIGHT, TOUCHDOWN, AFTER_LANDING, PUSHING
     by_steps: int  # 1: probabilities are fractions of a world's policy steps, 0: of its resets
@@ -84,7 +87,7 @@ class JumpStart:
 
 @wp.struct
 class JumpBase:
-    """Sampled pose and velocity of the base in one attempt at a start state; paws are placed around `spot`."""
+    """Pose and velocity of the base, sampled in one attempt at a start state, and the middle of the paws (`spot`)."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -113,9 +116,9 @@ def start_mode_at(probability: vec_start_modes, u: float) -> int:
 
 @wp.func
 def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
-    """Return the start mode whose policy steps so far fall farthest short of its share of all policy steps.
+    """Return the start mode with the largest deficit of policy steps: its wanted number less its number so far.
 
-    probability: shares of the modes, which add up to 1.
+    The wanted number is the mode's `probability` times all policy steps; the probabilities add up to 1.
     """
     total = float(0.0)
     for i in range(NUM_START_MODES):
@@ -132,7 +135,10 @@ def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_m
 
 @wp.func
 def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
-    """Return the start mode of a new episode: sampled, or with `by_steps` the `least_sampled_mode` (after resets)."""
+    """Return the start mode of a new episode: a random one, or with `ranges.by_steps` the `least_sampled_mode`.
+
+    While no policy steps are counted it is random in both cases.
+    """
     if ranges.by_steps != 0 and wp.length_sq(steps_per_mode) > 0.0:
         return least_sampled_mode(ranges.start_probability, steps_per_mode)
     return start_mode_at(ranges.start_probability, uniform(rng, streams.START_MODE, 0.0, 1.0))
@@ -140,7 +146,10 @@ def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_s
 
 @wp.func
 def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
-    """Return a sampled orientation (xyzw, body to world) around yaw `heading`, `pitch` (nose down) and roll 0 [rad]."""
+    """Return an orientation (xyzw, body to world) with yaw, pitch and roll sampled around heading, pitch and 0 [rad].
+
+    Each angle is at most `ranges.tilt` off; a positive pitch lowers the nose.
+    """
     yaw = heading + uniform(rng, streams.YAW, -ranges.tilt, ranges.tilt)
     sampled_pitch = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
     roll = uniform(rng, streams.ROLL, -ranges.tilt, ranges.tilt)
@@ -197,9 +206,9 @@ def landed_base(start: JumpStart, rng: RngStream) -> JumpBase:
 
 @wp.func
 def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
-    """Return the vertical takeoff speed [m/s] at base height `height` [m] of a jump over `distance` [m].
+    """Return the vertical takeoff speed [m/s] with which the base reaches the height `apex` [m] from `height` [m].
 
-    It reaches `apex` [m]; if that is 0, it follows from a sampled takeoff angle. g [m/s^2].
+    If apex is 0, it follows from `distance` [m], horizontal, and a sampled takeoff angle. g [m/s^2].
     """
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
@@ -241,9 +250,9 @@ def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 
 @wp.func
 def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
-    """Return the base state shortly before touchdown: behind its ballistic flight, so that the paws are ahead of it.
+    """Return the base state shortly before touchdown: `flight` moved back by a sampled distance, with the paws ahead.
 
-    flight: base on the flight; the paws (`spot`) stay below it.
+    flight: base state on the ballistic flight; the paws (`spot`) stay below its position.
     """
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
@@ -254,10 +263,10 @@ def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBa
 
 @wp.func
 def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
-    """Return the base state during push-off: on a straight line to the takeoff, with constant acceleration.
+    """Return the base state during push-off, a sampled distance before the base state `takeoff`.
 
-    takeoff: state at the end of the line. Its position and speed are those `push_length` [m] before takeoff; its paws
-    are around the origin.
+    The base moves on a straight line to `takeoff` with a sampled constant acceleration (`push_length`,
+    `push_acceleration`). Its paws are around the origin.
     """
     base = takeoff
     back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
@@ -293,9 +302,10 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return sampled motor angles of leg `leg` in flight, at rest; reachable if its paw is >= 0.01 m above ground.
+    """Return sampled motor angles of leg `leg` in flight, with rates 0.
 
-    Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
+    They are marked as reachable if the paw is at least 0.01 m above the ground. They are within 0.03 rad (lateral) or
+    0.1 rad (outer, inner) of a value sampled once for all legs.
     """
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]

@@ -41,7 +41,7 @@ class JumpState:
 
 @wp.func
 def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
-    """Return the horizontal vector from the base origin to the goal [m], world axes."""
+    """Return the horizontal vector (z = 0) from the base origin to the goal [m], world axes."""
     return wp.vec3(state.goal[0] - robot.pos[0], state.goal[1] - robot.pos[1], 0.0)
 
 

@@ -39,7 +39,10 @@ def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: 
 
 @wp.func
 def turned_touchdown(robot: RobotView, state: JumpState, rotation: float, yaw: float) -> bool:
-    """Terminate at touchdown if the rotation from level exceeds `rotation` [rad], or the yaw error `yaw` [rad]."""
+    """Terminate at touchdown if the base's orientation is too far from level with the jump's heading.
+
+    Limits [rad]: `rotation` of the rotation angle between the two orientations, `yaw` of the yaw error.
+    """
     turn = yaw_of(robot.quat) - state.heading
     yaw_error = wp.abs(wp.atan2(wp.sin(turn), wp.cos(turn)))
     return state.touched_down == 1 and (angle_from_level(robot.quat, state.heading) > rotation or yaw_error > yaw)
@@ -77,14 +80,17 @@ def slanted_takeoff(robot: RobotView, state: JumpState, speed: float) -> bool:
 
 @wp.func
 def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
-    """Terminate if the base decelerates by more than `stance` [m/s^2] in stance, `flight` [m/s^2] in later phases."""
+    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases."""
     limit = wp.where(state.phase == STANCE, stance, flight)
     return base_deceleration(robot) < -limit
 
 
 @wp.func
 def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float) -> bool:
-    """Terminate if no takeoff follows a command within `steps` policy steps, or the base rests for `idle_steps`."""
+    """Terminate if no takeoff follows a command within `steps` policy steps, or the robot idles instead of pushing off.
+
+    It idles if the base rests for more than `idle_steps` policy steps.
+    """
     return waiting(state) and (state.steps - state.command_step > int(steps) or state.idle_steps > int(idle_steps))
 
 

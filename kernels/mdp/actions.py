@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
-    """Begin a policy step of a world: store the base's velocity as `prev_lin_vel`, and apply the push to the base.
+    """Begin a policy step of a world: store the base's velocity as `prev_lin_vel`, apply an external push to the base.
 
     push [N], [N m]: (num_worlds,), world axes; without a paw in contact it acts only if push_in_flight is 1.
     """

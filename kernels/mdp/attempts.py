@@ -36,7 +36,7 @@ def first_leg(rng: RngStream) -> int:
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return by how much this thread's loop over legs advances: 1 with one thread a world, 4 (one leg) with 32."""
+    """Return the increment of this thread's loop over legs: 1 if it samples all four legs, 4 if it samples one."""
     return wp.min(rng.lanes, 4)
 
 
@@ -73,10 +73,10 @@ def pose_is_valid(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, sample: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Return whether a sampled pose is valid: all legs, gathered from all threads, reachable and collision-free.
+    """Return whether a sampled pose is valid: all four legs are reachable and free of collisions.
 
-    sample: last leg that this thread sampled; reachable: whether all legs of this thread are. joint_q (COORDS,) and
-    joint_qd (DOFS,): coordinates of the attempt, completed here.
+    The threads of an attempt exchange their legs. sample: last leg that this thread sampled; reachable: whether all
+    legs of this thread are. joint_q (COORDS,) and joint_qd (DOFS,): coordinates of the attempt, completed here.
     """
     all_reachable = all_legs(rng, reachable)
     if rng.lanes == 1 and not all_reachable:

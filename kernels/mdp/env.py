@@ -24,7 +24,7 @@ class Scene:
 
 @wp.struct
 class NoSettings:
-    """Empty struct in place of settings, for resets without settings and tasks without levels."""
+    """Struct without content: the settings of a reset, or level of a task, that has none."""
 
     unused: float
 
@@ -69,7 +69,7 @@ class Counters:
 
 @wp.struct
 class SkillSettings:
-    """Constants of a skill (task): action scale, command filter, thresholds and margins."""
+    """Constants of a skill (task), such as scale and filter of actions and margins of collision checks."""
 
     action_scale: vec12  # [rad] offset from the default pose at an action of 1
     command_filter: FilterParams

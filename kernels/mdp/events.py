@@ -1,4 +1,4 @@
-"""Kernel stage that runs a task's events (changes of robot parameters): at startup, at resets and at intervals."""
+"""Kernel that runs a task's events (changes of robot parameters): at startup, at resets and at intervals."""
 
 import warp as wp
 
@@ -15,9 +15,9 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of
 
 @wp.func
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
-    """Return a random number of policy steps, at least 1, after which an interval event is due again.
+    """Return a random number of policy steps, at least 1, until an interval event is due again.
 
-    It is uniform from least to most [s], over step_dt [s].
+    The time until then is uniform from least to most [s]; step_dt [s]: policy step.
     """
     return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
@@ -40,8 +40,9 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         timer: wp.array2d(dtype=int),
         robot: RobotParameters,
     ):
-        """Run the events (changes of robot parameters) due at a stage in worlds of `skill` with mask != 0.
+        """Run the events (changes of robot parameters) that are due, in worlds of `skill` with mask != 0.
 
+        stage: STARTUP, AT_RESET or AT_STEP, when the kernel is launched: at startup, at resets, in each policy step.
         Launch over (events, lanes, num_worlds). first: event of the first thread. The lanes share the loops of
         `parallel` events; lane 0 runs all others. mask: (num_worlds,). p: numbers of the task's terms. timer: (events,
         num_worlds), policy steps until an interval event is due, 0: not set, as after a handover. An interval event is

@@ -19,9 +19,10 @@ def hand_over(
     arrays: RobotArrays, parameters: RobotParameters, episode: EpisodeArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
-    """Make skill `target` active in a world: set its motor constants, clear requests and observation history.
+    """Make skill `target` active in a world: set its motor constants, and clear the observation history.
 
-    The previous actions become the `target` action that yields the present filtered motor targets.
+    The request of a task (`Env.request`) is cleared too. The previous actions become the `target` action that yields
+    the present filtered motor targets.
     """
     episode.skill[world] = target
     episode.requested_task[world] = NONE
@@ -59,9 +60,9 @@ def restore_task_kernel(
     parameters: RobotParameters,
     episode: EpisodeArrays,
 ):
-    """Make the first skill of worlds with mask != 0 active: set motor constants, clear requests; one thread per world.
+    """Make the skill `home` of each world with mask != 0 active, and set its motor constants; one thread per world.
 
-    home: (num_worlds,) index of each world's first skill.
+    The request of a task (`Env.request`) is cleared. home: (num_worlds,) skill with which a world's episodes begin.
     """
     world = episode.first + wp.tid()
     if mask[world] == 0.0:
@@ -74,7 +75,7 @@ def restore_task_kernel(
 
 
 def make_handover_kernel(handover: Any) -> wp.Kernel:
-    """Return the kernel that performs a handover (a `jumper_warp.tasks.cfg.Handover`) where it is due."""
+    """Return the kernel that performs a `jumper_warp.tasks.cfg.Handover` in the worlds in which its condition holds."""
     when, begin, set_command = handover.when, handover.begin, handover.target.command.set
 
     name = kernel_name("handover_kernel", handover.source.state, handover.target.state)

@@ -21,7 +21,7 @@ LANES = wp.constant(32)  # Threads that share the components of a world, so that
 
 @wp.struct
 class ObservationColumn:
-    """Indices of one number of an observation: where it is read, how it is processed, and where it is written."""
+    """Indices of one component of an observation: where it is read, how it is processed, and where it is written."""
 
     raw: int  # row in `ObservationArrays.raw`
     group: int  # index of the group
@@ -40,7 +40,10 @@ class ObservationColumn:
 
 @wp.struct
 class ObservationArrays:
-    """Observations of all worlds; `now` and `final` are flat, per group (num_worlds, columns), groups end to end."""
+    """Observations of all worlds: values of the terms, and processed observations after and before resets.
+
+    `now` and `final` are flat: they join the arrays (num_worlds, columns) of all groups.
+    """
 
     raw: wp.array2d(dtype=float)  # (components, num_worlds) values of the terms
     now: wp.array(dtype=float)  # observations for the next step, after resets
@@ -52,7 +55,7 @@ class ObservationArrays:
 
 @wp.func
 def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
-    """Return where a number of an observation is read and written, from the table of indices `columns`.
+    """Return the indices of one component of an observation (`ObservationColumn`), read from the table `columns`.
 
     columns: (fields of `ObservationColumn`, components).
     """
@@ -82,9 +85,9 @@ def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)) -> b
 
 @wp.func
 def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)) -> bool:  # noqa: F811
-    """Write element j of the vector value of an observation term in a world to out[row + j, world].
+    """Write the vector value of an observation term in a world to rows of `out`; return whether all of it is finite.
 
-    Returns whether all elements are finite.
+    Its element j is written to out[row + j, world].
     """
     for j in range(len(value)):
         out[row + j, world] = value[j]

@@ -9,7 +9,7 @@ _definitions: dict[str, list] = {}  # structs by their key, in the order of thei
 
 
 def kernel_name(name: str, *structs: Any) -> str | None:
-    """Return a kernel name that is unique to these definitions of structs, or None where Warp's own name suffices.
+    """Return a kernel name that distinguishes structs of equal names, or None where Warp's default name suffices.
 
     A struct that is defined again, as by a notebook's cell that runs again, needs kernels of another name: Warp would
     return the kernels with equal code, whose arguments have the earlier struct.

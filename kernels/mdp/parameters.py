@@ -103,7 +103,10 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Sample the Coulomb friction of each motor from lower to upper [N m], plus `motor_friction_move`."""
+    """Sample the Coulomb friction of each motor uniformly from a range (lower, upper) [N m], shifted for each motor.
+
+    shift: `motor_friction_move`; limits below 0 become 0.
+    """
     for m in range(rng.lane, 12, rng.lanes):
         value = moved_uniform(rng, m, lower, upper, robot.motor_friction_move[m])
         robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = value
@@ -191,9 +194,9 @@ def friction(
     robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
-    """Sample dynamic and static friction coefficients [1] of a robot's paws from their ranges plus `friction_move`.
+    """Sample dynamic and static friction coefficients [1] of a robot's paws from their ranges, each one shifted.
 
-    The static one is at least the dynamic one.
+    shift: `friction_move`; limits below 0 become 0. The static one is at least the dynamic one.
     """
     dynamic = moved_uniform(rng, 0, dynamic_lower, dynamic_upper, robot.friction_move[0])
     static = wp.max(moved_uniform(rng, 1, static_lower, static_upper, robot.friction_move[1]), dynamic)
@@ -211,15 +214,16 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 @wp.func
 def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: float) -> bool:
-    """Return at random whether a delay is nominal, with `nominal_probability`; never if its range is a single value."""
+    """Return True with `nominal_probability`: a delay gets its nominal value. Always False if lower is upper."""
     return lower < upper and uniform(rng, 1, 0.0, 1.0) < nominal_probability
 
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
-    """Sample the latency of actions from lower to upper [s], plus `latency_move`.
+    """Sample the latency of actions uniformly from a range (lower, upper) [s], shifted by `latency_move`.
 
-    With `zero_probability` it is the nominal one, which is 0 for the described robot, unless lower is upper.
+    Limits below 0 become 0. With `zero_probability` it is the nominal one, which is 0 for the described robot, unless
+    lower is upper.
     """
     seconds = moved_uniform(rng, 0, lower, upper, robot.latency_move)
     if is_nominal(rng, lower, upper, zero_probability):

@@ -39,9 +39,9 @@ def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
 
 @wp.func
 def stream_at(key: wp.uint32, purpose: int, world: int, stream: int) -> RngStream:
-    """Return random stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread.
+    """Return random stream number `stream` of a world in one policy step, whose `step_key` is `key`.
 
-    purpose: index in `jumper_warp.utils.streams.PURPOSES`.
+    It is for a thread that samples alone (`lanes` 1). purpose: index in `jumper_warp.utils.streams.PURPOSES`.
     """
     rng = RngStream()
     rng.world = world
@@ -53,7 +53,7 @@ def stream_at(key: wp.uint32, purpose: int, world: int, stream: int) -> RngStrea
 
 @wp.func
 def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: int) -> RngStream:
-    """Return random stream number `stream` of a world, for one thread; step_count: policy steps made by the world."""
+    """Return random stream number `stream` of a world that has made `step_count` policy steps (see `stream_at`)."""
     return stream_at(step_key(seed, world, step_count), purpose, world, stream)
 
 

@@ -206,9 +206,10 @@ def clear_history_kernel(
     arrays: RobotArrays,
     delays: Delays,
 ):
-    """Clear actions, torques, contacts and delays of worlds with mask != 0; one thread per (motor, world).
+    """Clear the stored actions, torques and contacts of worlds with mask != 0; one thread per (motor, world).
 
-    Targets become the present motor angles; paw and base kinematics are updated. first: world of the first thread.
+    Present and past motor targets become the present motor angles; paw and base kinematics are updated. first: world of
+    the first thread.
     """
     m, world = wp.tid()
     world += first

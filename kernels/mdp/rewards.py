@@ -27,7 +27,7 @@ def square_sum(v: vec12) -> float:
 
 @wp.func
 def posture_offset(robot: RobotView, shift: float) -> float:
-    """Return the rms offset [rad] of all motors from a pose: default angles, transversal ones plus `shift` [rad]."""
+    """Return the rms offset [rad] of all motors from the default pose plus `shift` [rad] on transversal angles."""
     total = float(0.0)
     for m in range(12):
         offset = robot.angle[m] - robot.default_angle[m]

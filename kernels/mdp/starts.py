@@ -1,4 +1,4 @@
-"""Helpers of all tasks to sample start states: legs from foot positions, foot positions, orientations.
+"""Helpers of all tasks to sample start states: foot positions, inverse kinematics of a leg, orientations.
 
 A foot position is the ankle (the paw's centre) unless stated otherwise.
 """
@@ -54,7 +54,7 @@ def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> 
 def sample_foot_offset(
     rng: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
-    """Return a sampled foot position [m] of leg `leg` from the stance's centre: x ahead, y to the left, z = 0.
+    """Return a sampled foot position [m] of leg `leg` relative to the middle of the stance: x ahead, y left, z = 0.
 
     front_x, front_y, back_x, back_y [m]: ranges (lower, upper) of |x| and |y| of front and back legs.
     """

@@ -1,4 +1,4 @@
-"""Unrolling of loops in kernel functions, whose hash Warp then computes without building the kernel."""
+"""Unrolling of loops in kernel functions, so that Warp finds a cached kernel without building it first."""
 
 import ast
 import hashlib

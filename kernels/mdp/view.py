@@ -232,9 +232,10 @@ def tilt(robot: RobotView) -> float:
 
 @wp.func
 def base_deceleration(robot: RobotView) -> float:
-    """Return the base's acceleration along its previous velocity [m/s^2], mean of the policy step; 0 if it speeds up.
+    """Return minus the base's deceleration along its previous velocity [m/s^2]; 0 if it speeds up.
 
-    The result is <= 0. A rebound does not count: at most the whole previous speed is lost within a policy step.
+    It is a mean of the policy step, <= 0. A rebound does not count: at most the whole previous speed is lost within a
+    policy step.
     """
     speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:

@@ -57,9 +57,10 @@ def walk_to_jump_due(robot: RobotView, state: VelocityState, requested: bool) ->
 
 @wp.func
 def jump_to_walk_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """Return whether walking takes over from a jump: at rest after landing, or as recovery, requested or not.
+    """Return whether walking takes over from a jump: when the robot is at rest after landing, or the jump went wrong.
 
-    Recovery: tilted after landing, not at rest within RECOVER_STEPS, or no takeoff within NO_JUMP_STEPS.
+    It does so without a request too. The jump went wrong if the robot is tilted after landing or not at rest within
+    RECOVER_STEPS, or if it has not taken off within NO_JUMP_STEPS.
     """
     if state.phase == LANDED:
         over = at_rest(robot) or tilt(robot) > LOST_TILT or state.phase_steps >= RECOVER_STEPS
@@ -77,7 +78,7 @@ def begin_walk(robot: RobotView, state: JumpState) -> VelocityState:
 
 @wp.func
 def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
-    """Return the initial state of a jump after walking, without a command; the handover sets the requested one."""
+    """Return the initial state of a jump after walking, not commanded yet; the handover sets a requested command."""
     new = JumpState()
     new.heading = yaw_of(robot.quat)
     new.start = robot.pos
@@ -90,7 +91,7 @@ def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
 
 @wp.func
 def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """Return whether requested turning takes over from a jump in flight: from FREE_STEPS steps after takeoff on."""
+    """Return whether turning takes over from a jump: on request, FREE_STEPS or more policy steps into the flight."""
     return requested and state.phase == FLIGHT and state.phase_steps >= FREE_STEPS
 
 
@@ -107,7 +108,7 @@ def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) ->
 
 @wp.func
 def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
-    """Return the initial state of turning in the flight of a jump: goal orientation level, with the jump's heading."""
+    """Return the initial state of turning during a jump's flight; the goal is level, with the heading of the jump."""
     new = AttitudeState()
     new.jump_start = state.start
     new.jump_goal = state.goal

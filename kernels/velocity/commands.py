@@ -1,4 +1,4 @@
-"""Velocity commands: sampled at resets and within episodes, or set by the host program."""
+"""Velocity commands: sampled at resets and within episodes, or set from Python (`Env.command`)."""
 
 import warp as wp
 

@@ -60,7 +60,7 @@ def push(arrays: RobotArrays, ground: Ground, world: int) -> vec6:
 
 @wp.func
 def ground_heights(arrays: RobotArrays, ground: Ground, world: int) -> vec15:
-    """Height of the base above 15 points of the ground [m], less 0.35.
+    """Height of the base above a 5 x 3 grid of ground points around it [m], less 0.35.
 
     Element 3 i + j is 0.25 (i - 2) m ahead (i: 0 to 4) and 0.2 (j - 1) m to the left (j: 0 to 2) in the base's heading.
     """

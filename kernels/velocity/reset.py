@@ -1,4 +1,4 @@
-"""Reset of velocity tracking: curriculum levels and a command; `start_states` samples the state of the robot."""
+"""Reset of velocity tracking: update curriculum levels, sample a command; `start_states` samples the robot state."""
 
 import warp as wp
 
@@ -28,7 +28,7 @@ def map_limit(map: TileMap) -> wp.vec2:
 def carried_over(
     old: VelocityState, pos: wp.vec3, tolerance: float, command_levels: int, terrain_levels: int
 ) -> VelocityState:  # fmt: skip
-    """Return a state for a new episode that keeps only statistics of `old`, and updated curriculum levels.
+    """Return a state for a new episode with the accumulated statistics of `old` and updated curriculum levels.
 
     The reset sets the other fields. pos [m]: base at the end of the old episode. A full episode with a mean error up to
     `tolerance` [m/s] raises both levels by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.

@@ -70,7 +70,7 @@ def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: 
 
 @wp.func
 def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -> float:
-    """Penalty of lateral motors far from the default pose, -4 to 0.
+    """Penalty of lateral motors far from the default pose: 0 near it, -1 for each motor far from it.
 
     It is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad].
     """
@@ -84,7 +84,7 @@ def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -
 
 @wp.func
 def transversal_position(robot: RobotView, state: VelocityState, steepness: float, shift: float) -> float:
-    """Penalty of transversal motors far from the default pose plus `shift` [rad], -8 to 0.
+    """Penalty of transversal motors far from the default angle plus `shift` [rad]: 0 near it, -1 for each one far off.
 
     It is the sum over them of exp(-steepness offset^20) - 1; offset [rad].
     """
@@ -119,7 +119,7 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 def clamped_rapid_stepping(robot: RobotView, state: VelocityState, threshold: float, limit: float) -> float:
     """Penalty of rapid stepping: sum over paws of exp(max(0, touchdowns in the last 0.75 s - threshold)) - 1.
 
-    limit [1]: largest penalty.
+    It is clamped to `limit` [1].
     """
     total = float(0.0)
     for k in range(4):
@@ -135,7 +135,7 @@ def restless_stand(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def foot_clearance(robot: RobotView, state: VelocityState, target_height: float) -> float:
-    """Penalty of swinging paws above or below `target_height` [m].
+    """Penalty of paws that swing above or below `target_height` [m], weighted by their horizontal speed.
 
     It is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s].
     """
@@ -188,7 +188,7 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
 def shank_lean(
     robot: RobotView, state: VelocityState, threshold: float, hip: float, thigh: float, shank: float
 ) -> float:
-    """Penalty of shanks that lean more than `threshold` [rad] over a paw on the ground.
+    """Penalty of shanks inclined by more than `threshold` [rad] from the vertical, in legs whose paw is on the ground.
 
     It is the sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2]. A shank that
     leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include the pitch of

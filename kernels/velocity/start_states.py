@@ -31,7 +31,10 @@ class TileMap:
 
 @wp.struct
 class VelocitySettings:
-    """Ranges from which start states of velocity tracking are sampled; pairs (lower, upper), half width w: -w to w."""
+    """Ranges from which start states of velocity tracking are sampled; pairs are (lower, upper).
+
+    A half width w means the range from -w to w.
+    """
 
     map: TileMap
     episode_steps: int  # policy steps that an episode lasts
@@ -94,9 +97,10 @@ def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
 
 @wp.func
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
-    """Return the base's sampled pose and velocity around `start.spot`; vertical velocity has 0.3 of the range.
+    """Return a sampled pose and velocity of the base, with a position around `start.spot`.
 
-    A `sample_base` of `mdp.attempts.sample_valid_state`.
+    The range of the vertical velocity is 0.3 times that of the horizontal ones. A `sample_base` of
+    `mdp.attempts.sample_valid_state`.
     """
     settings = start.settings
     v = settings.lin_vel

@@ -71,9 +71,9 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state of velocity tracking (errors, steps, gait phase) updated by one policy step.
+    """Return the state of velocity tracking (errors, step counts, gait phase) updated by one policy step.
 
-    Errors count more than `settle` policy steps after a command.
+    Errors count only when more than `settle` policy steps have passed since the command.
     """
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1
