@@ -32,7 +32,7 @@ SUMMARY = ("settled_without_collision_rate", *HARDWARE, "any_axis_settling_time_
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs, AttitudeFlags):
-    """Flags of the test of turns: `num_turns` turns about body axes, and as many about random axes."""
+    """Flags of the test of a floating robot: `num_turns` rotations about body axes, and as many about random axes."""
 
     policy: str = "attitude"
     keep_momentum: bool = True  # Conserve the momentum of free flight exactly, regardless of the training's setting
@@ -46,7 +46,7 @@ class Args(EvaluationArgs, AttitudeFlags):
 
 
 def plot_turns(run: EvaluationRun, turns: AttitudeLog, conditions: str) -> None:
-    """Plot errors over time and settling times of turns of `axis_turns` into `turns.png`, a color per axis."""
+    """Plot angles to the goal and settling times of turns about body axes into `turns.png`, with a color per axis."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
     with figure(run.folder / "turns.png", 1, 2, figsize=(11, 5), title="Turns", conditions=conditions) as axes:

@@ -1,4 +1,4 @@
-"""Train jump tasks with one departure from the paper undone at a time, and write metrics, a table, a plot and runs.
+"""Train ablations of a jump task, each without one departure from the paper; write metrics, a table, a plot and runs.
 
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
@@ -31,7 +31,7 @@ from support.scripts import ThreadArgs, announce, prepare, report, run_script, t
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the trainings with one departure from the paper undone at a time."""
+    """Flags of the training of ablations of a jump task, each without one departure from the paper."""
 
     task: JumpTask = "vertical-jump"  # Task whose departures are undone
     only: tuple[str, ...] = ()  # Names of the departures to undo, or kept for none (default: all)
@@ -58,13 +58,13 @@ class Args(ThreadArgs):
         return JUMP_TASKS[self.task].iterations if self.iterations is None else self.iterations
 
     def trainings(self) -> Iterator[tuple[str, int, Ablation]]:
-        """Yield name of the departure (or BASELINE), seed, and ablation (BASELINE: no flags) of every training."""
+        """Yield the departure that is left out (BASELINE: none), the seed and the ablation of every training."""
         for name in self.only or (BASELINE, *DEPARTURES[self.task]):
             for seed in self.baseline_seeds if name == BASELINE else self.seeds:
                 yield name, seed, DEPARTURES[self.task].get(name, "")
 
     def command(self, ablation: Ablation, seed: int, folder: Path) -> list[str]:
-        """Return the arguments of `jumper train` for an ablation and a seed; folder: root of its logs."""
+        """Return the command-line arguments of `jumper train` for an ablation and a seed; folder: root of the logs."""
         flags = f"--num-envs {self.num_envs} --max-iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
@@ -73,7 +73,7 @@ class Args(ThreadArgs):
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Train and evaluate each ablation of a jump task, write the table and the plot, and return the metrics."""
+    """Train and evaluate each ablation of a jump task, write results as a table and a plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results = prepare("departures", args, args.threads), {}

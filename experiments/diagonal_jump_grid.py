@@ -1,4 +1,4 @@
-"""Measure how exactly a policy jumps ahead and aside, and write metrics, a plot, a picture and a recording.
+"""Measure how exactly a policy jumps diagonally forward, and write metrics, a plot, a picture and a recording.
 
     python experiments/diagonal_jump_grid.py --policy horizontal_jump --out outputs/grid
 

@@ -1,4 +1,4 @@
-"""Kill and disturb small trainings at random, and compare each with an undisturbed training, bit by bit.
+"""Kill or disturb trainings at random moments, resume them, and compare each with an undisturbed one, bit by bit.
 
     python experiments/fault_campaign.py --out outputs/faults
     python experiments/fault_campaign.py --out outputs/faults --trials 240
@@ -85,7 +85,7 @@ def write_tables(folder: Path, trials: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the trials missing in the output folder until the time limit, and return metrics of all trials."""
+    """Run trials that the output folder lacks, until the time limit, and return metrics of all trials in the folder."""
     start, folder = time.monotonic(), output_dir("fault_campaign", args.out).absolute()
     with write_lock(folder):
         trials = read_trials(folder, args.seed)

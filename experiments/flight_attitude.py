@@ -1,4 +1,4 @@
-"""Compare landings after tilted takeoffs on Mars with and without turning in flight, and write metrics and plots.
+"""Compare landings on Mars with and without a policy that levels the robot in flight, and write metrics and plots.
 
     python experiments/flight_attitude.py --policy attitude --num-flights 100 --out outputs/flight
     python experiments/flight_attitude.py --takeoff policy --landing-policy mars_vertical_jump --randomize
@@ -31,7 +31,7 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the comparison of flights with and without turning."""
+    """Flags of the comparison of flights with and without a policy that levels the robot."""
 
     policy: str = "attitude"  # Name or folder of the policy that turns, a run's folder, or a checkpoint
     landing_policy: str = ""
@@ -56,7 +56,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Simulate the same flights with and without turning, plot tilts and heights, and return the metrics."""
+    """Simulate the same flights with and without the turning policy, plot tilts and heights, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay

@@ -79,7 +79,7 @@ class RandomEnv:
         """Do nothing, since random observations need no reset."""
 
     def mirror(self, what: str) -> tuple[list[int], list[float]]:
-        """Return a mirror map (order, signs) that exchanges neighbours and negates every other pair."""
+        """Return a mirror map (order, signs) that swaps entries 0 and 1, 2 and 3, …, and negates every other pair."""
         size = SIZES["obs" if what == "observation" else "action"]
         pairs = 2 * (size // 2)
         order = [i ^ 1 for i in range(pairs)] + list(range(pairs, size))
@@ -87,7 +87,7 @@ class RandomEnv:
 
 
 def build(args: Args, device: torch.device, still: bool = False, **changes: object) -> Ppo:
-    """Return compiled PPO with weights of seed 0, fused unless `changes` of the settings say otherwise."""
+    """Return compiled PPO on a `RandomEnv`, with weights of seed 0; changes: other settings, such as `fused=False`."""
     torch.manual_seed(0)
     cfg = PpoCfg(num_steps=args.num_steps, epochs=args.epochs, hidden=args.hidden, fused=True)
     ppo = make_ppo(RandomEnv(args.num_envs, device, still), dataclasses.replace(cfg, **changes))  # pyright: ignore
@@ -149,7 +149,7 @@ def repeats(args: Args, device: torch.device) -> bool:
 
 
 def times(ppo: Ppo, args: Args) -> dict[str, float]:
-    """Return the times of an acting step, an update and a fused minibatch's parts [us], on a GPU as graphs."""
+    """Return the times [us] of an acting step, an update and parts of a fused minibatch; on a GPU as CUDA graphs."""
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     parts: dict[str, Callable[[], object]] = {"collect": ppo.collect, "update": ppo.update}
@@ -172,7 +172,7 @@ def times(ppo: Ppo, args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> dict:
-    """Check gradients and repetition, time the fused and the eager update, write and return the metrics.
+    """Check gradients and bitwise reproducibility, time fused and eager update, write and return the metrics.
 
     Raises InputError: the device cannot use the fused update.
     """

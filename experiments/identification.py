@@ -1,4 +1,4 @@
-"""Measure how well identification finds the parameters of known robots, and write metrics, a plot and robot overlays.
+"""Measure how well identification finds the known parameters of simulated robots; write metrics, a plot and overlays.
 
     python experiments/identification.py --num-matched 20 --out outputs/identification
 
@@ -39,7 +39,7 @@ Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the test of identification on known robots."""
+    """Flags of the test of identification on simulated robots with known parameters."""
 
     num_matched: int = 20  # Number of robots that are identified with the simulator that recorded them
     num_mismatched: int = 1
@@ -58,7 +58,7 @@ class Args(OutputArgs):
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Identify known robots and test the predictions in the selected parts of the test; write and return the metrics.
+    """Identify simulated robots and test the predictions, in the parts `args.parts`; write and return the metrics.
 
     The computation is on the CPU.
     """

@@ -1,4 +1,4 @@
-"""Measure how reliably `jumper sysid` separates good fits from local minima, on robots far from their description.
+"""Measure how reliably `jumper sysid` separates good fits from local minima, on robots whose parameters are unusual.
 
     python experiments/identification_starts.py --workers 16 --out outputs/identification_starts
 
@@ -41,7 +41,7 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the test of identification on robots far from their description."""
+    """Flags of the test of identification on robots with parameters far from the nominal ones."""
 
     num_robots: int = 40  # Number of robots
     num_noises: int = 3  # Number of recordings of each robot
@@ -70,7 +70,7 @@ def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
 
 
 def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return metrics of all fits: numbers of accepted and good ones, coverage of 95 % intervals, and CPU time."""
+    """Return metrics of all fits: numbers of accepted (consistent) and good ones, interval coverage, and CPU time."""
     accepted, good = ([fit for fit in fits if fit[name]] for name in ("consistent", "good"))
     bad = [fit for fit in accepted if not fit["good"]]
     cpu = [fit["cpu_s"] for fit in fits]

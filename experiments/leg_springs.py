@@ -55,7 +55,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the jumps of all springs and squats, plot apex over stiffness, and return the metrics."""
+    """Simulate a jump for each spring stiffness and squat angle, plot the best apexes, and return the metrics."""
     folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip

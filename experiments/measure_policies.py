@@ -1,4 +1,4 @@
-"""Measure the shipped policies in all conditions and tests, and write metrics.json and the tables of the pages.
+"""Measure the shipped policies in all conditions and tests, and write their metrics.json and the tables in docs/.
 
     python experiments/measure_policies.py --out outputs/policies
     python experiments/measure_policies.py --out outputs/policies --save-to-policies
@@ -102,7 +102,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
 
 
 def main(args: Args) -> int:
-    """Evaluate policies in missing conditions, or write tables and policies' files from existing results.
+    """Evaluate policies in missing conditions, or save existing results to the policies, or write tables from them.
 
     Returns the number of evaluations (rows), or of pages that changed.
     """

@@ -52,7 +52,7 @@ class Args(DeviceArgs):
 
 
 def factor_of(robot: RobotOverlay | None, name: str) -> float:
-    """Return the smallest factor of a robot overlay on a quantity of the transversal motors, 1 without overlay."""
+    """Return the smallest factor [1] by which an overlay scales `name` of the transversal motors; 1 without overlay."""
     return 1.0 if robot is None else float(getattr(robot.robots(), name)[0, list(TRANSVERSAL)].min())
 
 

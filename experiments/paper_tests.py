@@ -32,7 +32,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all test suites of the policies' tasks, print and return the metrics with a value in the paper.
+    """Run the paper's tests of each policy, print and return those metrics for which the paper states a value.
 
     Keys: `<policy>_<suite>_<key>`.
     """

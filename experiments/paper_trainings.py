@@ -1,4 +1,4 @@
-"""Train the paper's tasks and ablations of its three techniques, test them as the paper did, and write metrics of each.
+"""Train the paper's tasks with and without each of the paper's three techniques, test the policies, and write metrics.
 
     python experiments/paper_trainings.py --tasks vertical-jump-paper --arms full --seeds 0 --out outputs/paper
     python experiments/paper_trainings.py --table --out outputs/paper     # table and curves so far
@@ -64,7 +64,7 @@ class Args(ThreadArgs):
             raise InputError("num_jumps and save_interval must be at least 1, seeds at least 0")
 
     def trainings(self) -> Iterator[tuple[str, str, int]]:
-        """Yield (task, ablation or "full", seed) of each training, the first seed of every ablation first."""
+        """Yield (task, ablation or "full", seed) of each training: all trainings with the first seed, then the next."""
         for seed in self.seeds:
             for name in self.tasks:
                 walks = make_task(name).evaluation_suite == "velocity"

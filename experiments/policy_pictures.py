@@ -105,7 +105,7 @@ class Args(ThreadArgs):
 
 
 def record(name: str) -> Recording:
-    """Simulate one episode of a policy for its picture, or the course of three policies, and return the recording."""
+    """Simulate an episode of a policy, or for COURSE a walk with jumps by three policies, and return the recording."""
     if name == COURSE:
         run, log = SkillRun(), CourseLog([read_script(SCRIPT)])
         env, ground = run.env(1), "plane"
@@ -120,7 +120,7 @@ def record(name: str) -> Recording:
 
 
 def main(args: Args) -> dict:
-    """Draw the pictures and films of all policies, and return their sizes by name."""
+    """Draw the pictures and films of all policies, and return the sizes of the files [KiB] by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
     for name in tracked(args.policies, "drawing policies"):
@@ -142,7 +142,7 @@ def main(args: Args) -> dict:
 
 
 def save_tile(paths: list[Path], path: Path) -> None:
-    """Write one picture of several in two columns, each added to the shorter column; the longer one is cut off."""
+    """Write a picture that shows several in two columns, each below the shorter column; the longer one is cut off."""
     columns, heights = ([], []), [0, 0]
     for each in paths:
         picture = Image.open(each).convert("RGB")

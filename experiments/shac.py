@@ -60,7 +60,10 @@ class Args(DeviceArgs):
 
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
-    """Return an environment of TASK without randomisation and noise; history: observed policy steps, None: default."""
+    """Return an environment of TASK without randomisation and noise.
+
+    history: number of policy steps that an observation covers, None: the task's.
+    """
     task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 

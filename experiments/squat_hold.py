@@ -1,4 +1,4 @@
-"""Measure how quietly a policy waits for its command to jump, and write metrics, a plot and a recording.
+"""Measure how steadily a policy holds a squat before its jump is commanded, and write metrics, a plot and a recording.
 
     python experiments/squat_hold.py --policy vertical_jump --out outputs/hold
     python experiments/squat_hold.py --policy horizontal_jump --num-squats 500 --randomize
@@ -44,7 +44,7 @@ class Args(EvaluationArgs):
 
 
 def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
-    """Plot forces and torques of the robot with the largest force range, and all ranges, into `hold.png`."""
+    """Plot forces and torques of the robot with the largest force range, and all force ranges, into `hold.png`."""
     time = (np.arange(len(squats.forces)) + 1) * squats.step_dt
     robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
     settings = {"title": "Held squats", "conditions": f"{run.title}, {len(squats.ended)} robots"}

@@ -1,4 +1,4 @@
-"""Measure how well three policies take turns on one robot, and write metrics, a plot, a picture and a recording.
+"""Measure how well a robot switches between three policies, and write metrics, a plot, a picture and a recording.
 
     python experiments/walk_jump_walk.py --num-robots 200 --out outputs/walk_jump_walk
 
@@ -41,7 +41,7 @@ PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turni
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the test of walking and jumping in turns."""
+    """Flags of the test of a robot that switches between walking and jumping policies."""
 
     policy: str = "walking_flat"  # Policy that walks: name or folder, a run's folder, or a checkpoint
     jump_up: str = "vertical_jump"  # Policy that jumps to heights
@@ -69,7 +69,7 @@ def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
 
 
 def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptStep]:
-    """Return a script of COMMANDS random walks, turns and jumps, with at least one jump of each kind.
+    """Return a script of COMMANDS random commands to walk, turn in place or jump, with each kind of jump at least once.
 
     blocks: False to replace jumps onto a block by jumps to a position.
     """

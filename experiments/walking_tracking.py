@@ -47,7 +47,7 @@ SUMMARY = (*PAPER, "fall_rate", "settling_time_median_s", "top_ahead_m_s", "kick
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the tests of walking by commanded velocities."""
+    """Flags of the tests of how well a policy follows commanded velocities."""
 
     policy: str = "walking_flat"
     commands_per_axis: int = 13

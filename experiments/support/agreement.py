@@ -80,7 +80,7 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
 
 
 def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
-    """Compute the paws' positions and their Jacobians by this project's dynamics, base level at the origin.
+    """Compute the paws' positions and Jacobians by this project's dynamics, with the base unrotated at the origin.
 
     Keys: `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad].
     q: joint coordinates (n, 43), whose base orientation is overwritten.

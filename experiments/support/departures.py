@@ -1,4 +1,4 @@
-"""Departures of the jumps from the paper and its authors' configuration, undone one at a time.
+"""Ablations of the jump tasks: each undoes one departure from the paper and its authors' configuration.
 
 `docs/results/departures.csv` has all departures and their reasons, `docs/results/paper.md` the effects of these,
 measured by `experiments/departures.py`.
@@ -17,7 +17,7 @@ Point = tuple[float, float, float]  # [m] x, y, z of a goal
 
 
 def may_jump_early(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task that allows takeoffs before the command, without `early_takeoff`."""
+    """Return a copy of the task in which a takeoff before the command does not end the episode."""
     terminations = tuple(term for term in task.terminations if term.name != "early_takeoff")
     return replace(task, terminations=terminations)
 
@@ -34,18 +34,27 @@ def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int)
 
 
 def heights_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with goal heights of 0.6 to 1.1 m in three levels, all with the last start heights."""
+    """Return a copy of the task with goal heights of 0.6 to 1.1 m in three levels.
+
+    All levels have the last range of start heights of the task.
+    """
     return with_goals(task, [((0.0, 0.0, 0.6), (0.0, 0.0, top)) for top in (0.75, 0.9, 1.1)], starts=1)
 
 
 def places_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with goals 0.4 to 1.0 m ahead, up to 0.3 m aside, in four steps of two levels each."""
+    """Return a copy of the task with goals 0.4 to 1.0 m ahead and up to 0.3 m to either side.
+
+    There are four goal ranges, each with the last two ranges of start heights of the task.
+    """
     tops = ((0.55, 0.0), (0.7, 0.1), (0.85, 0.2), (1.0, 0.3))
     return with_goals(task, [((0.4, -y, 0.0), (top, y, 0.0)) for top, y in tops], starts=2)
 
 
 def places_of_sequel(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the Mars task with the goals of the authors' sequel, 1.4 to 4.75 m ahead, in four steps."""
+    """Return a copy of the Mars task with the goals of the authors' sequel, 1.4 to 4.75 m ahead.
+
+    There are four goal ranges, each with the last two ranges of start heights of the task.
+    """
     (_, *low), (_, *top) = task.levels[-1].goal_lower, task.levels[-1].goal_upper
     ahead = ((1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75))
     return with_goals(task, [((near, *low), (far, *top)) for near, far in ahead], starts=2)
@@ -128,5 +137,5 @@ DEPARTURES: dict[str, dict[str, Ablation]] = {
 
 
 def ablation_flags(ablation: Ablation) -> str:
-    """Return the flags of `jumper train` that make an ablation, empty if it is a function."""
+    """Return the flags of `jumper train` that make an ablation; empty if it is a function that changes the task."""
     return ablation if isinstance(ablation, str) else ""

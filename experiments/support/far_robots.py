@@ -1,4 +1,4 @@
-"""Robots with parameters far from the described: sampled, recorded with noise, identified, compared with the truth."""
+"""Identification of simulated robots with parameters far from the nominal ones, and comparison with the truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DRAWS = 10_000  # Number of sampled errors of an estimate
 
 
 def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
-    """Sample normalised parameters (P,) of a robot with masses, gains, friction and latency far from the described."""
+    """Sample normalised parameters (P,) of a robot with masses, gains, friction and latency far from nominal."""
     z = OWN * rng.normal(size=len(parameters))
     for quantity in FAR:
         members = [i for i, parameter in enumerate(parameters) if parameter.quantity == quantity]
@@ -41,16 +41,20 @@ def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
 
 
 def is_good(error: np.ndarray) -> np.ndarray:
-    """Return which fits are good, (...): few errors (..., P) [standard deviations] beyond 95 % limits, none far."""
+    """Return which fits are good, (...) bool: few parameters are outside their 95 % intervals, and none far.
+
+    error: absolute errors of the parameters [standard deviations], (..., P). Limits: MOST_OUTSIDE, FARTHEST_OUTSIDE.
+    """
     outside = (error > CONFIDENCE).mean(axis=-1)
     return (outside <= MOST_OUTSIDE) & (error.max(axis=-1) <= FARTHEST_OUTSIDE)
 
 
 def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Generator) -> float:
-    """Return the probability that a fit in the right minimum fails `is_good` by chance, from `DRAWS` sampled errors.
+    """Return the probability that a fit which found the right minimum fails `is_good` only because of noise.
 
-    An error common to many parameters leaves many intervals at once. With the covariance C of the posterior, and the
-    unit prior at 0, the estimate of a robot z has mean z - C z and covariance C - C C. truth: z, (P,).
+    It is estimated from `DRAWS` sampled errors. They are correlated: one cause can move many parameters out of their
+    intervals. With the covariance C of the posterior, and the unit prior at 0, the estimate of a robot z has mean
+    z - C z and covariance C - C C. truth: z, (P,).
     """
     covariance = result.covariance
     errors = rng.multivariate_normal(-covariance @ truth, covariance - covariance @ covariance, size=DRAWS)

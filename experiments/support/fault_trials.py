@@ -1,4 +1,4 @@
-"""Trials of the fault campaign: each disturbs one training and compares its end with an undisturbed training."""
+"""Trials of the fault campaign: each disturbs and resumes a training, and compares it with an undisturbed one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Reference(NamedTuple):
 
 
 class Trial:
-    """A training with faults: its random numbers, its folder, and the faults so far."""
+    """One training with faults: its folder, its random number generator, and the list of its faults (`events`)."""
 
     def __init__(self, seed: int, number: int, folder: Path) -> None:
         """Create an empty folder; the random numbers are a function of the campaign's seed and the trial's number."""
@@ -79,7 +79,7 @@ class Trial:
         return faults.fork(partial(faults.launch_ranks, job, ranks, restarts) if ranks > 1 else job, log), log
 
     def run(self, before: Action = lambda: None, ranks: int = 1, restarts: int = 0) -> int:
-        """Run a training to its end, with arguments as `start`, and return the exit code; `text` is its output."""
+        """Run a training to its end, store its output in `text`, and return the exit code; arguments: as of `start`."""
         pid, log = self.start(before, ranks, restarts)
         code = faults.wait(pid)
         self.text = log.read_text()
@@ -87,7 +87,10 @@ class Trial:
         return code
 
     def operation(self, start: float = 0.0, end: float = 1.0) -> int:
-        """Return the number of a random file operation from fraction `start` to `end` of the remaining training."""
+        """Return the index, from 1, of a random file operation in a part of the remaining training.
+
+        start, end: begin and end of the part, as fractions of the remaining training.
+        """
         total, done = reference(self.training_seed, 1, self.folder.parent).operations, self.saved_iteration()
         rest = total * (1.0 - done / faults.ITERATIONS)
         return 1 + int(rest * self.rng.uniform(start, end))
@@ -105,7 +108,7 @@ class Trial:
         return latest_checkpoint(folder / CHECKPOINTS).state["iteration"]
 
     def add(self, fault: str) -> None:
-        """Record a fault in the training that has just ended."""
+        """Append a fault of the training that has just ended, and the number of iterations lost to it, to `events`."""
         reached = [int(number) for number in re.findall(r"^iteration (\d+)/", self.text, re.MULTILINE)]
         self.events.append(Event(fault, max(0, max(reached, default=0) - self.saved_iteration())))
 
@@ -126,7 +129,7 @@ class Trial:
 
 
 class Unexpected(Exception):
-    """A trial ended in a way that is not expected of it."""
+    """Raised when a training of a trial ends with an unexpected exit code, output or result."""
 
 
 def check(expected: bool, text: str) -> None:
@@ -137,7 +140,10 @@ def check(expected: bool, text: str) -> None:
 
 @cache
 def reference(seed: int, ranks: int, folder: Path) -> Reference:
-    """Return the result of an undisturbed training with a seed and a number of ranks, made once in a folder."""
+    """Return the result of an undisturbed training; only the first call with these arguments trains.
+
+    folder: of the campaign, in which the training gets a subfolder.
+    """
     trial = Trial(0, 0, folder / f"reference_{seed}_{ranks}")
     trial.training_seed, counted = seed, trial.folder / "operations"
 
@@ -230,7 +236,7 @@ def full_disk(trial: Trial) -> None:
 
 
 def read_only(trial: Trial) -> None:
-    """Take away the write permission of the folders of a run, or of its root before the training."""
+    """Make the folder of logs read-only before a training, or this folder and its subfolders during a training."""
     trial.root.mkdir()
 
     def allow(mode: int) -> None:
@@ -284,7 +290,7 @@ def writers(trial: Trial) -> None:
 
 
 def killed_rank(trial: Trial) -> None:
-    """Kill one of two ranks under torchrun, which restarts them or not."""
+    """Kill one of two ranks of a training under torchrun, with no restart or one restart allowed."""
     rank, restarts, operation = trial.choose(0, 1), trial.choose(0, 1), trial.operation(0.1, 0.9)
 
     def kill() -> None:

@@ -40,7 +40,10 @@ Action = Callable[[], object]
 
 
 def warm_up() -> None:
-    """Import all that a training imports, and build its kernels' code, without threads that a fork would lose."""
+    """Import all that a training imports, and build its kernels' code, before processes are forked.
+
+    It starts no threads, as a forked process would lack them.
+    """
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # a forked process could not use a GPU
     for module in ("cli.train", "cli.resumed", "cli.training_memory", "rl.runner", "envs.env", "policies.restore"):
         importlib.import_module(f"jumper_warp.{module}")
@@ -92,9 +95,9 @@ def wait(pid: int) -> int:
 
 
 def on_file_operations(root: Path, actions: Mapping[int, Action]) -> Callable[[], int]:
-    """Call actions before numbered file operations below a folder; return a function that counts the operations.
+    """Call `actions[n]` before the n-th file operation below a folder; return a function that returns their number.
 
-    The first operation is number 1. It lasts until the process ends.
+    The first operation has n = 1. Operations are counted until the process ends.
     """
     count, prefix = 0, f"{root}{os.sep}"
 

@@ -1,8 +1,8 @@
-"""Long flights: takeoff by a policy, or open loop with legs that push off unequally; log, metrics and environment.
+"""Jumps in which a policy can turn the robot in flight: log, metrics, plot and environment.
 
-Open loop, the robot squats, holds and extends as in `open_loop`, some legs later than others, so that it takes off
-tilted and rotating. In flight the turning skill is requested; shortly before the landing the jump skill takes over
-again, a policy or the default pose.
+The takeoff is by a policy or open loop. Open loop, the robot squats, holds and extends as in `open_loop`, some
+legs later than others, so that it takes off tilted and rotating. In flight the turning skill is requested; shortly
+before the landing the jump skill takes over again, a policy or the default pose.
 """
 
 from __future__ import annotations
@@ -124,7 +124,10 @@ class FlightLog(EvaluationLog):
                 "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
     def record_step(self, env: Any) -> bool:
-        """Record a policy step, request a turn of robots that took off in it; return whether all flights have ended."""
+        """Record a policy step; return whether all flights have ended.
+
+        If `turns`, request the turning skill for robots that took off in this step.
+        """
         before = self._takeoff_step.copy()
         ended = super().record_step(env)
         took_off = (self._takeoff_step >= 0) & (before < 0)
@@ -181,7 +184,7 @@ class FlightLog(EvaluationLog):
         return np.array([*OUTCOMES, NO_END])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per flight: takeoff tilt and spin, touchdown tilt, apex_m, end (outcome)."""
+        """Return takeoff tilt and spin, touchdown tilt, apex height and outcome of all flights, as lists by name."""
         columns = {
             "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
             "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
@@ -193,7 +196,7 @@ class FlightLog(EvaluationLog):
         return {"tilt/of {} [deg]": np.degrees(self.tilts[-1]), "height/base of {} [m]": self.heights[-1]}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return commanded heights `asked_m` and delays of the extension `late_ms` (front, left) of some worlds."""
+        """Return commanded apex heights `asked_m` of some worlds, and `late_ms`, the delays of front and left legs."""
         notes = {"asked_m": self.apex[list(worlds)].tolist()}
         return notes if self.late is None else notes | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
 
@@ -300,7 +303,7 @@ class FlightRun(Run):
         return env
 
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:
-        """Run the flights of a new log, and return it; film: name of the recording."""
+        """Run one flight per world into the empty log `flights`, and return the log; film: name of the recording."""
         self.flights = flights
         self.run_episodes(env, flights, film=film)
         return flights

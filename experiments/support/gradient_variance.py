@@ -99,7 +99,7 @@ def stats_over_horizons(
 
 
 def measure_stats(make_env: Callable[[], Env], horizons: tuple[int, ...]) -> StatsByPolicy:
-    """Measure the gradients of both policies: return statistics by policy and estimator, one per horizon.
+    """Measure the gradients of the trained and the new policy: return statistics by policy and estimator, per horizon.
 
     Horizons are in policy steps.
     """
@@ -124,7 +124,7 @@ def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
 
 
 def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:
-    """Plot the gradients' standard deviation, and the worlds needed, over the horizon.
+    """Plot the gradients' standard deviation over the horizon, and the number of worlds at which noise equals signal.
 
     A color per policy, a line style per estimator.
     """

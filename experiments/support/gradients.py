@@ -153,7 +153,7 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
         return gradient, differences(inputs, name, directions, step, device)
 
     def at_entries(name: str, indices: list, step: float, gradient: np.ndarray, inputs: dict) -> GradientPair:
-        """Pair derivatives of the apex by entries of an input with their central differences."""
+        """Pair derivatives of the apex with respect to single entries of an input with their central differences."""
         directions = unit_directions(gradient.shape, indices)
         return compare(np.array([gradient[index] for index in indices]), name, directions, step, inputs)
 

@@ -74,7 +74,7 @@ def prediction_errors(case: Case, robots: RobotValues, simulate: Simulate) -> tu
 
 
 def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> dict[str, float]:
-    """Compare identified parameters with the true ones: largest errors, coverage of 95 % intervals, mismatch.
+    """Compare identified and true parameters: return errors, coverage of 95 % intervals, and their widening (mismatch).
 
     result: identified from the case. Keys end with the unit; coverage, error_over_deviation_rms, mismatch are [1].
     """
@@ -100,7 +100,7 @@ def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> di
 def run_case(
     parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
-    """Identify a known robot, and return the accuracy, prediction errors and effort as metrics, and the result.
+    """Identify a robot with known parameters: return errors and computing time as metrics, and the result.
 
     replay: simulates the motions of the identification; ours: simulates a plan with the model, for the predictions;
     dt [s]: physics step of the model, None: the default.
@@ -121,11 +121,11 @@ def run_case(
 
 
 def policy_errors(name: str, jumps: int, case: Case, result: Identification, folder: Path) -> dict[str, float]:
-    """Compare a policy's jumps on the nominal and the identified robot with those on the true robot.
+    """Return mean differences between a policy's apexes on the true robot and on the nominal or identified one [m].
 
-    Returns the mean errors of the predicted apexes [m].
     name: of the policy; jumps: number of them, to heights of 0.5 to 1.0 m; result: identified from the case. Robots
-    are saved as overlays into `folder`. `policy_success_<robot>` is the rate of reached heights.
+    are saved as overlays into `folder`. The result also has `policy_error_on_true_m`, the mean error of the apexes on
+    the true robot, and `policy_success_<robot>`, the rate of reached heights.
     """
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     identified = identified_overlay(result, "identified")

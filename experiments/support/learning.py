@@ -53,7 +53,10 @@ def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, goals: np.ndarray) -> JumpLog:
-    """Run one jump per world to commanded goals [m], as `JumpLog` takes them; act: see `run_evaluation`."""
+    """Run one jump per world to a commanded goal, and return the finished log.
+
+    act: as for `run_evaluation`; goals [m]: as for `JumpLog`.
+    """
     jumps = JumpLog(goals, env.task.termination_names)
     run_evaluation(act, env, jumps)
     return jumps
@@ -88,9 +91,10 @@ def train_and_evaluate(
     env: VecEnv, trainer: Ppo | Shac, eval_env: Env, length: float, every: float,
     limits: tuple[float, float] | None = None, by_iterations: bool = False,
 ) -> LearningCurve:  # fmt: skip
-    """Train as `jumper train --max-seconds` or `--max-iterations` does, and return the learning curve.
+    """Train for a time or a number of iterations, evaluate at intervals, and return the learning curve.
 
-    Compilation (`warm_up`) and evaluations do not count as training time.
+    Schedules follow `length`, as in `jumper train --max-seconds` or `--max-iterations`. Compilation (`warm_up`)
+    and evaluations do not count as training time.
     env: environment of the training, not yet reset; eval_env: one world per evaluated jump; length: of the training,
     and every: between two evaluations, [s] or number of iterations; limits [m]: see `success_rate`.
     """
@@ -147,7 +151,7 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
 
 
 def compare(first: Sequence[LearningCurve], second: Sequence[LearningCurve], rate: float = 0.95) -> dict[str, float]:
-    """Return p-values of the hypotheses that two trainers learn alike, corrected after Holm.
+    """Return p-values of the hypotheses that two trainers are equally fast and successful, with Holm's correction.
 
     Two-sided rank tests (Mann-Whitney) of the steps to a success rate, infinite if it is not reached, and of the final
     success. Keys: `p_steps_to_95_percent`, `p_final_success`.

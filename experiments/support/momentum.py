@@ -68,7 +68,7 @@ class MomentumRecorder:
         self.angular.append(momentum(self.env.sim)[1])
 
     def metrics(self, diverged: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return metrics of the drift of the angular momentum, which should be 0, and of the turn it causes.
+        """Return metrics of the angular momentum, which should stay 0, and of the rotation that results from it.
 
         Diverged robots are left out.
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.

@@ -147,7 +147,7 @@ class MotionReplay:
         return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
     def metrics(self) -> dict[str, Any]:
-        """Return the metrics of the jump by name, which ends with the unit; `collisions`: flags of touching links."""
+        """Return the metrics of the jump, with units at the end of the names; `collisions`: bit flags of contacts."""
         return {
             "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
             "work_j": self.work,

@@ -24,7 +24,7 @@ SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the comma
 
 
 def largest_forces(forces: np.ndarray) -> np.ndarray:
-    """Return the largest force [N] on each paw in several physics steps, (4, 3); forces: (steps, 4, 3)."""
+    """Return each paw's force vector [N] at the step where its norm is largest, (4, 3); forces: (steps, 4, 3)."""
     return forces[np.linalg.norm(forces, axis=2).argmax(axis=0), np.arange(forces.shape[1])]
 
 
@@ -97,7 +97,7 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple, force: np.ndarray)
 
 
 def trace_metrics(trace: Trace) -> dict[str, float]:
-    """Return the metrics of the open-loop jump by name, which ends with the unit.
+    """Return the metrics of the open-loop jump, with units at the end of the names.
 
     Times count from the extension's command.
     """

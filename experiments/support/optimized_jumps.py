@@ -56,7 +56,7 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 
 
 def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
-    """Return random candidates of jumps with a run-up in place: actions [1], (count, len(knots)).
+    """Return random candidates of jumps that begin with a fall forward: actions [1], (count, len(knots)).
 
     The robot leans back, falls forward, crouches, extends the hind legs, then the front legs. Postures scatter around
     POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
@@ -73,7 +73,7 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
 
 
 def noisy_variants(solution: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
-    """Return 64 candidates around a solution of the optimisation, (64, len(knots)).
+    """Return 64 noisy copies of a solution, as candidates of another optimisation, (64, len(knots)).
 
     They are the solution (n,) plus noise of standard deviation 0 to 0.2. The solution may be of a shorter motion;
     missing knots are 0 before the noise.
@@ -103,7 +103,7 @@ class Jump:
         return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return a copy with the iterations of all search stages (not `polish`) times `effort` [1], at least 1."""
+        """Return a copy whose search stages have `effort` [1] times as many iterations, at least 1; `polish` stays."""
         stages = ((made, replace(s, iterations=max(1, round(effort * s.iterations)))) for made, s in self.stages)
         return replace(self, stages=tuple(stages))
 
@@ -222,7 +222,7 @@ LIMITED = {
 def optimise(
     jump: Jump, begin: np.ndarray, seed: int, polish: int, **settings: Any
 ) -> tuple[Progress, dict[str, float]]:
-    """Optimise a jump by all stages of the search; return the last descent and the numbers of simulated steps.
+    """Optimise a jump by all search stages and a last descent (`minimise`); return its result and the simulated steps.
 
     Keys: `simulated_steps` and `reverse_steps`, of all worlds.
     begin: candidates, (n, len(knots)); seed: of displacements; polish: iterations of the last descent; settings:

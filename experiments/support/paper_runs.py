@@ -91,7 +91,10 @@ def goals_of_test(test: str, num_jumps: int) -> np.ndarray:
 
 
 def make_log(task: TaskCfg, test: str, num_jumps: int) -> EvaluationLog:
-    """Return a new log of a test of the paper; jumps to places are commanded at once, as goals are always observed."""
+    """Return an empty log for one of the paper's tests, with the commands of the test.
+
+    Jumps to places are commanded at once, as their goals are always observed.
+    """
     if test == "sweep":
         return JumpLog(np.linspace(*HEIGHTS, num_jumps), task.termination_names)
     if test == "walk":

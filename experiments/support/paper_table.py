@@ -47,7 +47,7 @@ def finished(folder: Path, task: str, arm: str) -> list[dict[str, Any]]:
 
 
 def cell(folder: Path, task: str, arm: str, key: str) -> str:
-    """Format a metric of an ablation (arm): mean and range over seeds, and their number if some did not reach it.
+    """Format a metric of an ablation (arm): mean and range over seeds, and how many have a value if not all do.
 
     GAP: no seed has it, NEVER: none reached it.
     """

@@ -51,7 +51,7 @@ ERRORS = {
 
 
 def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
-    """Return a Markdown table of the policy for each of a user's NEEDS: its commands, success, error and exclusions."""
+    """Return a Markdown table with a policy for each of NEEDS: tested and trained commands, success, error, limits."""
     lines = []
     for words, policy, unless, tests in NEEDS:
         rows, task = first_seed(policy), tasks[policy]

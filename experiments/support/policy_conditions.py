@@ -1,4 +1,4 @@
-"""Test conditions of the shipped policies: names, words, settings, and where they are undefined."""
+"""Test conditions of the shipped policies: names, descriptions, settings, and for which tasks they are undefined."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def with_trials(flags: Any, trials: int) -> Any:
 
 
 def commands_of(flags: Any) -> str:
-    """Describe the commands of an evaluation in words; flags: of `jumper evaluate`."""
+    """Return the ranges of an evaluation's goals or velocity commands as text; flags: of `jumper evaluate`."""
     if isinstance(flags, AttitudeFlags):
         return f"turns by {flags.angle:g}°"
     if isinstance(flags, VelocityFlags):

@@ -25,7 +25,7 @@ def pages() -> list[Path]:
 
 
 def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
-    """Make the generated table `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice` or `seeds` of a page.
+    """Return a table as Markdown; name: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`, `choice` or `seeds`.
 
     Raises InputError: there is no such table.
     """

@@ -70,12 +70,12 @@ def saved_rows(policy: str) -> list[Row]:
 
 
 def tasks_of(policies: Iterable[str]) -> dict[str, TaskCfg]:
-    """Return the tasks of policies by name."""
+    """Return the tasks of policies by name of the policy, without COMBINED."""
     return {policy: EvaluationRun(policy).task for policy in policies if policy != COMBINED}
 
 
 def earlier_metrics(policy: str) -> dict[str, Any]:
-    """Return the metrics of a policy under the definitions before version 1 of metrics.json, by suite."""
+    """Return the saved metrics of a policy that were measured under earlier definitions, by suite."""
     path = metrics_file(policy)
     return json.loads(path.read_text())["earlier"]["suites"] if path.is_file() else {}
 

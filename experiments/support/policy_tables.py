@@ -22,7 +22,7 @@ SHORT = ("nominal", "randomised", "SolverMuJoCo", "friction 0.4")  # Their title
 
 
 class TableColumn(NamedTuple):
-    """Column of a table of results, or row of a policy's main table."""
+    """Title and metrics of a column of a table of results, or of a row of a policy's main table."""
 
     title: str
     keys: tuple[str, ...]  # Metrics, separated by slashes
@@ -130,7 +130,7 @@ def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
 
 
 def number(key: str, value: Any) -> str:
-    """Format a metric's value: a rate in per cent, seconds and degrees with two decimals, else four."""
+    """Format a metric's value: rates in per cent, others with one, two or four decimals, which depend on the key."""
     if value is None:
         return "–"
     if key.endswith("_rate"):
@@ -274,7 +274,7 @@ def test_table(name: str) -> str:
 
 
 def key_table(name: str) -> str:
-    """Return the table of the metrics' keys of an evaluation: unit, statistic and trials; name: of KEYS."""
+    """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
     lines = [[f"`{metric.key}`", "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
               metric.statistic.__name__, metric.over] for metric in KEYS[name]]  # fmt: skip
     return markdown(("key", "unit", "statistic", "over"), lines)

@@ -1,4 +1,4 @@
-"""Further tests of single policies: goals aside, obstacles, farthest jumps, waiting, terrains, several policies.
+"""Tests of single policies or of three in combination, such as sideways goals, farthest jumps, terrains and courses.
 
 Each test is a command that writes metrics.json. The ten conditions that all policies share are in `policy_conditions`.
 """

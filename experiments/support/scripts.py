@@ -37,7 +37,7 @@ class DeviceArgs(OutputArgs):
 
 @dataclass(frozen=True)
 class ThreadArgs(DeviceArgs):
-    """Flags of an experiment script whose worlds may share CPU threads."""
+    """Flags of an experiment script that can use several CPU threads."""
 
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
 

@@ -172,7 +172,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     termination = wp.to_torch(env.episodes.termination)
 
     def step_held() -> None:
-        """Step the environment with one random action for `args.hold_steps` steps, and count after each."""
+        """Take `args.hold_steps` steps with one random action, and update the counters after each."""
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold_steps):
             env.step(action)
@@ -182,7 +182,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     check_interval = max(args.episode_steps // args.hold_steps, 1)
 
     def round_of_steps(i: int) -> None:
-        """Run a round of steps, and check the counters after some of the rounds."""
+        """Run `step_held`; every `check_interval` rounds, raise RuntimeError if any values were not finite."""
         run()
         if (i + 1) % check_interval == 0 and (rows := counters.read().rows):
             raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold_steps}")
@@ -214,7 +214,7 @@ def resident_memory() -> int:
 
 
 def rebuild_growth(make: Callable[[], Env], args: SoakArgs) -> dict[str, int]:
-    """Make and drop environments, and reset one for evaluations; return the growth of resident memory [KiB] of each.
+    """Return the growth of resident memory [KiB] over repeated builds, and over evaluation resets, of an environment.
 
     After a reset and in a new environment, random actions are held for `args.hold_steps` policy steps.
     """

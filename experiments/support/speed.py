@@ -137,7 +137,7 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
 
 
 def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
-    """Measure policy steps per second on a CPU by number of threads, and the speedup of last over first.
+    """Measure policy steps per second on a CPU by number of threads, and the speedup from the first number to the last.
 
     Repetitions alternate and the fastest counts, as other load only slows them down. `thread_speedup` is the smaller
     speedup of physics and environment.

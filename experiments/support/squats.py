@@ -38,7 +38,7 @@ class SquatLog(EvaluationLog):
         return self.hold
 
     def begin(self, env: Env) -> None:
-        """Reset every robot to the default pose, with its goal and a command after the simulated time."""
+        """Reset every robot to the default pose, with a goal whose jump would be commanded after the end."""
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
@@ -61,7 +61,7 @@ class SquatLog(EvaluationLog):
         return bool(self.ended.all())
 
     def in_window(self, values: list[np.ndarray]) -> np.ndarray:
-        """Return the part of a history within the evaluated window, of the robots not ended.
+        """Return the values within the evaluated window, of the robots whose episodes have not ended.
 
         values: arrays per policy step; the result is (steps, robots, ...).
         """
@@ -84,7 +84,7 @@ class SquatLog(EvaluationLog):
         return np.sqrt(self.in_window(self.torques).var(axis=0).mean(axis=1))
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per robot not ended: paw_force_range_n, torque_ripple_nm."""
+        """Return force range and torque ripple of each robot whose episode has not ended, as lists by name."""
         return {"paw_force_range_n": self.force_range.tolist(), "torque_ripple_nm": self.torque_ripple.tolist()}
 
     def series(self) -> dict[str, np.ndarray]:

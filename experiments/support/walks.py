@@ -22,13 +22,13 @@ HOLD = 0.5  # [s] Time with an error below SETTLED after which a robot has settl
 
 
 def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
-    """Return a new log of walks of 7 s whose commanded velocity changes after 3 s, see `step_commands`."""
+    """Return an empty log for walks of 7 s whose commanded velocity changes after 3 s (`step_commands`)."""
     commands = step_commands(rng, env.num_envs, REACH, STEP)
     return VelocityLog(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
 
 
 def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
-    """Return a new log of walks whose commanded velocity rises along one of DIRECTIONS, and these directions.
+    """Return an empty log for walks whose commanded velocity rises along one of DIRECTIONS, and these directions.
 
     The directions are each robot's index in DIRECTIONS, (robots,).
     """
@@ -43,7 +43,7 @@ def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
 
 @dataclass(kw_only=True)
 class KickedWalks(VelocityLog):
-    """Log of walks in which the velocity of each base has a step change."""
+    """Log of walks in which each base is kicked once: its velocity changes abruptly by `kick`."""
 
     kick_time: np.ndarray  # [s] (robots,) Time of the step change
     kick: np.ndarray  # [m/s] (robots, 2) Step change of the velocity, world axes
@@ -60,7 +60,7 @@ class KickedWalks(VelocityLog):
 
 
 def kicked_walks(env: Env, rng: np.random.Generator) -> KickedWalks:
-    """Return a new log of walks of 7 s with a random command and a kick in a random direction after 2 to 4 s."""
+    """Return an empty log for walks of 7 s with a random command, and a kick in a random direction after 2 to 4 s."""
     n = env.num_envs
     commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
