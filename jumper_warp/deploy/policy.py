@@ -126,9 +126,10 @@ class DeployedPolicy:
         return self.action
 
     def filter_targets(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
-        """Limit motor targets [rad], (12,), near the joint limits, as `kernels/actuation/command_filter.py` does.
+        """Return motor targets [rad], (12,), from which `limit_command` removes part of the excess over joint limits.
 
-        Each angle is limited, then each leg's sum of outer and inner angle. target, angle: (12,) [rad]; rate: [rad/s].
+        It is applied to each angle, then to each leg's sum of outer and inner angle, as in
+        `kernels/actuation/command_filter.py`. target, angle: (12,) [rad]; rate: [rad/s].
         """
         settings = self.interface["command_filter"]
         target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND).reshape(4, 3)
@@ -190,7 +191,7 @@ def _width(term: Mapping[str, Any]) -> int:
 def limit_command(
     command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, float], settings: Mapping[str, Any]
 ) -> np.ndarray:
-    """Limit commands [rad] near joint limits: a fraction `weight` of their excess over a limit is removed.
+    """Return commands [rad] from which a fraction `weight` of the part beyond the joint limits is removed.
 
     weight: 1 - (time until the joint reaches a limit) / horizon, in [0, 1]. Within the zone of a limit it is 1 for
     commands toward the limit, else 0; beyond a limit it is 1.
@@ -227,10 +228,10 @@ class JumpCommand:
         self.requested = True
 
     def update(self, vertical_velocity: float, paws_down: int) -> float:
-        """Follow the jump through takeoff and landing, and return `jump_command`, 0 or 1. Call it once per policy step.
+        """Detect takeoff and landing, clear the command at landing, and return `jump_command`, 0 or 1.
 
-        vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
-        Raises InputError, and changes nothing: one is not finite.
+        Call it once per policy step. vertical_velocity: of the base, world frame, upward positive [m/s]; paws_down:
+        number of paws on the ground. Raises InputError, and changes nothing: one is not finite.
         """
         if not (math.isfinite(vertical_velocity) and math.isfinite(paws_down)):
             raise InputError(f"vertical_velocity and paws_down must be finite, got {vertical_velocity}, {paws_down}")

@@ -23,7 +23,7 @@ HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 
 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
-    """Return rotations by an angle [deg] about the body axes in turn (DIRECTIONS), as quaternions (count, 4), xyzw."""
+    """Return rotations by an angle [deg] about the axes of DIRECTIONS in cyclic order, quaternions (count, 4), xyzw."""
     half, rows, quats = 0.5 * np.radians(angle), np.arange(count), np.zeros((count, 4))
     quats[rows, rows % 6 // 2] = np.where(rows % 2 == 0, 1.0, -1.0) * np.sin(half)  # even rows: plus, odd: minus
     quats[:, 3] = np.cos(half)
@@ -40,7 +40,7 @@ def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
 
 @dataclass
 class AttitudeLog(EvaluationLog):
-    """Log of a turn in flight per world; properties have shape (num_envs,). A diverged world records NaN."""
+    """Log of one commanded turn in free flight per world; properties: (num_envs,). A diverged world records NaN."""
 
     turns: np.ndarray  # (num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the start
     tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
@@ -82,7 +82,7 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def error(self) -> np.ndarray:
-        """Angle to the goal at the end [rad], (num_envs,)."""
+        """Angle to the goal after the last policy step [rad], (num_envs,); NaN if the world has diverged."""
         return self.errors[-1]
 
     @property
@@ -93,7 +93,7 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def settling_time(self) -> np.ndarray:
-        """Settling time, from which the error stayed within `tolerance` [s], (num_envs,); NaN if larger at the end."""
+        """Time from which the error stays within `tolerance` to the end [s], (num_envs,); NaN if there is none."""
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         outside = np.where((~inside).any(axis=0), len(inside) - (~inside)[::-1].argmax(axis=0), 0)
         return np.where(inside[-1], (outside + 1) * self.step_dt, np.nan)
@@ -105,7 +105,7 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Masks (num_envs,) that select the turns over which a metric is computed, by name."""
+        """Sets of turns from which metrics are computed: a mask (num_envs,) by the set's name, such as "turns"."""
         return {"turns": np.full(self.count, True), "turns that settled": ~np.isnan(self.settling_time),
                 "turns that reached the goal": ~np.isnan(self.first_time),
                 "turns that did not diverge": ~self.diverged}  # fmt: skip
@@ -117,7 +117,10 @@ class AttitudeLog(EvaluationLog):
         return np.where(self.diverged, DIVERGED, ends)
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per turn: turn_x to turn_w, error_deg, first_s, settling_s, end (outcome)."""
+        """Return one value per turn by name: commanded quaternion, final error, times to the goal, outcome.
+
+        Keys: turn_x to turn_w, error_deg, first_s (`first_time`), settling_s (`settling_time`), end (outcome).
+        """
         columns = {f"turn_{axis}": self.turns[:, i] for i, axis in enumerate("xyzw")}
         columns |= {"error_deg": np.degrees(self.error), "first_s": self.first_time, "settling_s": self.settling_time}
         return listed(columns | {"end": self.outcomes})

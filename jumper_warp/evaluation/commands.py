@@ -104,7 +104,7 @@ class FilmCfg:
             check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
     def write(self, recording: Recording) -> Path:
-        """Write a film of a recording to the file `video`; return its path."""
+        """Write a film of a recording to the path `video`, and return that path."""
         from jumper_warp.viz.film import write_film
 
         assert self.video is not None
@@ -141,10 +141,9 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
-    """Simulate a policy, write a recording and `metrics.json` (the columns of the log), print a summary.
+    """Simulate a policy, write a recording and `metrics.json`, print a summary, and return the recording's path.
 
-    Returns the path of the recording.
-
+    `metrics.json` holds the columns of the log, one value per trial.
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
     from jumper_warp.evaluation.log import run_evaluation
@@ -170,7 +169,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 
 def played_name(source: str | Path) -> str:
-    """Return the name of a policy, or of a run or checkpoint as in `logs/TASK/RUN`, for titles."""
+    """Return the name of a policy for titles, or "run RUN" for the folder or a checkpoint of the training run RUN."""
     folder = Path(source).parent.parent if Path(source).suffix == ".pt" else Path(source)
     return f"run {folder.resolve().name}" if is_run_folder(folder) else folder.resolve().name
 
@@ -221,10 +220,10 @@ def play_script(cfg: ScriptCfg) -> Path:
 def show_recording(
     run: Run, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
 ) -> Path:  # fmt: skip
-    """Write a recording as .rrd, picture and, on request, film; print a summary, open the viewer on request.
+    """Write a recording (.rrd, picture, film if requested), print a summary, and return the path of the .rrd file.
 
-    name: of the files and of a trial; count, keys: number of trials and main metrics, for the summary. Returns the path
-    of the .rrd file.
+    It opens the viewer that `cfg` names. name: of the files and of a trial; count, keys: number of trials and main
+    metrics, for the summary.
     """
     from jumper_warp.evaluation.recorder import save_recording
 
@@ -238,7 +237,7 @@ def show_recording(
 
 @dataclass(frozen=True)
 class DumpCfg:
-    """Show the state in which a term of a training was not finite: write a recording and a picture of the robot."""
+    """Show the robot's state at a non-finite value in training: write a recording and a picture of the robot."""
 
     dump: Path  # File that the training has written, RUN/non_finite/TERM.npz
     out: Path | None = None  # Folder for the results (default: outputs/play/<time>)
@@ -247,7 +246,7 @@ class DumpCfg:
 
 
 def play_dump(cfg: DumpCfg) -> Path:
-    """Write a recording and a picture of a robot state dumped for a non-finite value, print it; return the recording.
+    """Write a recording and a picture of a dumped robot state, print its non-finite terms, and return the .rrd path.
 
     The robot is shown on level ground. Raises InputError: the file is no dump; OSError: the folder cannot be created.
     """

@@ -109,7 +109,7 @@ class CourseLog(EvaluationLog):
         return float((self.durations.sum(axis=1) + JUMP_TIMEOUT * (self.target_skill != WALK).sum(axis=1)).max()) + 1.0
 
     def warn_beyond_training(self, tasks: Sequence[TaskCfg]) -> None:
-        """Print a warning for each skill whose commands exceed those of its training; tasks: of the skills."""
+        """Print a warning for each skill whose commands exceed those of its training; tasks: one per skill."""
         for skill, task in enumerate(tasks):
             if (chosen := self.target_skill == skill).any():
                 warn_beyond_training(task, self.goal[chosen])
@@ -259,20 +259,20 @@ class CourseLog(EvaluationLog):
 
     @property
     def landing_error(self) -> np.ndarray:
-        """Distance from base to goal at the switch to walking [m], (robots, commands); NaN unless a jump to a place."""
+        """Distance from base to goal as walking takes over from a jump to a place [m], (robots, commands); else NaN."""
         return np.where(self.target_skill == JUMP_TO, np.linalg.norm(self.offset, axis=-1), np.nan)
 
     @property
     def on_goal(self) -> np.ndarray:
-        """Whether each command was completed, a jump within GOAL_TOLERANCE of its goal, (robots, commands)."""
+        """Whether each command was completed, for a jump also within GOAL_TOLERANCE of its goal, (robots, commands)."""
         error = np.where(self.target_skill == JUMP_UP, np.abs(self.apex_error), self.landing_error)
         near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
 
     def columns(self) -> dict[str, list]:
-        """Return results as lists with one value per robot: end, commands done, largest errors of jumps [m].
+        """Return one value per robot by name: outcome, number of completed commands, largest errors of its jumps [m].
 
-        Keys: end, commands_done, apex_error_m, landing_error_m.
+        Keys: end (outcome), commands_done, apex_error_m, landing_error_m.
         """
         worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
         return listed({"end": self.outcomes, "commands_done": (self.finish_step >= 0).sum(axis=1)} | worst)
@@ -342,10 +342,10 @@ def course_metrics(course: CourseLog) -> Metrics:
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ripple of paw forces before each switch (handover) to a jump, and their step at it [N], (handovers,).
+    """Return the variation of paw forces before each handover from walking to a jump skill, and their change at it [N].
 
-    Ripple: peak-to-peak force over the last FORCE_WINDOW seconds before the handover; step: change of the force between
-    the policy steps before and after it. Each is the maximum over the four paws.
+    Variation: peak-to-peak force over the last FORCE_WINDOW seconds before the handover, (handovers,); change: between
+    the policy steps before and after it, without a handover in the last step. Each is the maximum over the four paws.
     """
     force, ripples, steps = np.array(course.force, dtype=float), [], []
     window = round(FORCE_WINDOW / course.step_dt)
@@ -359,7 +359,10 @@ def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]]:
-    """Return when a robot used which skill: tuples of skill (WALK, JUMP_UP, JUMP_TO), begin and end [s], in order."""
+    """Return the time spans in which a robot used each skill, as tuples (skill, begin [s], end [s]) in order of time.
+
+    skill: WALK, JUMP_UP or JUMP_TO.
+    """
     skills = np.array(course.skills)[:, world]
     edges = [0, *(np.flatnonzero(np.diff(skills)) + 1).tolist(), len(skills)]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]

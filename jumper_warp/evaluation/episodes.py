@@ -88,13 +88,14 @@ class EpisodeLog(EvaluationLog):
         return np.array([*self.task.termination_names, NO_END])[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
-        """Return whether each episode ended by a termination with an option, `success` or `time_out`, (num_envs,)."""
+        """Return whether each episode ended by a termination with option `success` or `time_out` set, (num_envs,)."""
         return np.array([*(bool(term.options[option]) for term in self.task.terminations), False])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per episode: command_0 ..., length_s, mean_base_height_m, base_x_m ..., end.
+        """Return one value per episode by name: command, length, mean base height, final base position, outcome.
 
-        Without commands or of a single robot, start_<field> is each number of the task's state that the reset sampled.
+        Keys: command_<i>, length_s, mean_base_height_m, base_<axis>_m, end (outcome); without commands or of a single
+        robot also start_<field>, each number of the task's state that the reset sampled.
         """
         columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
@@ -125,9 +126,10 @@ def rows_are_equal(arrays: dict[str, np.ndarray]) -> bool:
 
 
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the floats of a task's state that differ between worlds, as columns start_<field>; vectors: with _<i>.
+    """Return the floats of a task's state that differ between worlds, as columns (num_envs,) named `start_<field>`.
 
-    Of a single world, those that are not 0. arrays: of `Env.task_arrays`.
+    Entry i of a vector is `start_<field>_<i>`; fields `base_*` are left out. Of a single world, fields that are not 0.
+    arrays: of `Env.task_arrays`.
     """
     columns = {}
     for name, values in arrays.items():

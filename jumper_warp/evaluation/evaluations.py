@@ -1,4 +1,4 @@
-"""Evaluation settings for each kind of task (flags, terminations): EVALUATIONS, by `TaskCfg.evaluation_suite`."""
+"""Table EVALUATIONS of evaluation settings (flags, terminations), with `TaskCfg.evaluation_suite` as key."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class EvaluationFlags(Protocol):
     """Interface of a dataclass with the flags of `jumper evaluate` for some tasks, such as jumps to heights."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return a new evaluation log, which commands all worlds and records outcomes; seed: of sampled commands."""
+        """Return a new evaluation log, which sets all worlds' commands and records outcomes; seed: of the commands."""
         ...
 
     def metrics(self, log: Any) -> Metrics:
@@ -46,7 +46,7 @@ class PlayFlags(Protocol):
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
-        """Return a new evaluation log, which commands all worlds and records their outcomes."""
+        """Return a new evaluation log, which sets the commands of all worlds and records their outcomes."""
         ...
 
 

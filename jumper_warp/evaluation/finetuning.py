@@ -120,15 +120,16 @@ def shift_goal_observation(policy: Policy, shift: float) -> Policy:
 def correct_aim(
     policy: Policy, groups: list[JumpGroup], log: Callable[[str], object]
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
-    """Correct a policy's aim at goals straight ahead; return the policy, and the errors [m] initially and per round.
+    """Shift the goals ahead that a policy observes, to reduce its landing errors; return the policy and the errors.
 
     Every round subtracts the weighted mean error from the observed goal; a round that does not lower the cost is undone
     and ends the correction. A factor on the goal would have little effect: the observed distance is short at landing.
-    Errors are the dicts `ahead` (mean, signed) and `mean_abs_miss_m` by group. log: prints a line of progress.
+    Errors [m], initially and after each successful round: dicts `ahead` (mean, signed) and `mean_abs_miss_m` by group.
+    log: prints a line of progress.
     """
 
     def measure(policy: Policy) -> tuple[float, list[JumpErrors], dict[str, dict[str, float]]]:
-        """Simulate the jumps of a policy; return their cost [1], errors by group, and mean errors [m]."""
+        """Simulate the jumps of a policy; return their cost [1], and errors and mean errors [m] of each group."""
         network = Network(policy, device=groups[0].env.device)
         errors = [jump_errors(group, network, derivatives=False) for group in groups]
         pairs = list(zip(groups, errors, strict=True))
@@ -158,7 +159,7 @@ def correct_aim(
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Reduce the errors of jumps by Gauss-Newton steps on the network's weights, in place.
+    """Reduce the errors of jumps by Gauss-Newton steps on the network's weights, in place; return errors by step.
 
     Returns one record before the steps and one per step.
     Keys: step, mean_abs_miss_m (by group [m]), cost, action_change (RMS [1]), seconds since `begin`, a value of
@@ -167,7 +168,7 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Simulate the jumps with the current weights; return the cost [1], trust region included, and the errors."""
+        """Simulate the jumps with the current weights; return cost [1], with the trust region's penalty, and errors."""
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)
@@ -198,8 +199,9 @@ def tune_weights(
 def finetune(
     policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
-    """Fine-tune a policy; return the new policy and a record: `settings`, `aims` (`correct_aim`), `steps`.
+    """Fine-tune a policy; return the new policy, and a dictionary of the settings and of the errors in each step.
 
+    Its keys: `settings`, `aims` (errors of `correct_aim`), `steps` (records of `tune_weights`).
     modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
     `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """

@@ -68,10 +68,10 @@ class JumpGroup:
 
 
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
-    """Return the differentiable landing point [m] of the ballistic flight from the apex, [x, y].
+    """Return x and y [m] of the landing points of ballistic flights from the jumps' apexes, (n,) each, differentiable.
 
-    Each is (n,), world frame.
-    states: of every policy step; steps: indices of the apexes in them, (n,). The base lands at LANDING_HEIGHT.
+    World frame; the base lands at LANDING_HEIGHT. states: of every policy step; steps: indices of the apexes in them,
+    (n,).
     """
     motions = [loop.motion(state) for state in states]
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))

@@ -42,7 +42,10 @@ def with_jump_terminations(task: TaskCfg) -> TaskCfg:
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of a task that ends evaluated jumps also at a second takeoff, as a failure (the authors' rule)."""
+    """Return a copy of a task that also ends evaluated jumps, as failures, when the robot takes off a second time.
+
+    This is the rule of the paper's authors.
+    """
     task = with_jump_terminations(task)
     takeoff = TerminationTerm(second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
@@ -65,9 +68,10 @@ def paw_arrays(env: Env) -> dict[str, np.ndarray]:
 
 
 def updated_apex(apex: np.ndarray, jump: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the largest base height in flight [m] of n jumps so far, (n,), after another policy step.
+    """Return the apexes [m] of n jumps, (n,), updated with the base heights of a policy step.
 
-    Before takeoff an apex is the current height; after touchdown it stays. jump: arrays (n, ...) of the step.
+    An apex is the largest base height in flight so far; before takeoff it is the current height, after touchdown it
+    stays. jump: arrays (n, ...) of the step.
     """
     begins = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
     flies, height = (jump["phase"] != LANDED) | (jump["touched_down"] == 1), jump["base_pos"][:, 2]
@@ -86,7 +90,7 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
 
 @dataclass(frozen=True)
 class JumpOutcome:
-    """Outcomes of simulated jumps: events and errors, arrays of shape (num_envs, jumps in a row)."""
+    """Outcomes of simulated jumps: events such as falls, and errors; arrays of shape (num_envs, jumps in a row)."""
 
     commanded: np.ndarray  # Whether the jump was commanded
     to_height: np.ndarray  # Whether the goal is an apex height, else a place
@@ -119,7 +123,7 @@ class JumpOutcome:
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Masks, shaped as the arrays, that select the jumps over which a metric is computed, by name."""
+        """Sets of jumps from which metrics are computed: a mask, shaped as the fields, by the name of the set."""
         return {
             "jumps": self.commanded, "jumps that touched down": self.touched_down, "landed jumps": self.landed,
             "successful jumps": self.success, "jumps that did not diverge": self.commanded & ~self.diverged,
@@ -132,7 +136,7 @@ class JumpOutcome:
         return np.select(*zip(*kinds, strict=True), default=np.where(self.landed, "not_at_rest", ""))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return events and errors of all jumps by name, flattened to (jumps,)."""
+        """Return all fields by name, such as `landed` and `apex_error_m`, flattened to one value per jump, (jumps,)."""
         return {field.name: getattr(self, field.name).ravel() for field in fields(self)}
 
 
@@ -247,7 +251,7 @@ class JumpLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the task's arrays, and contacts, positions and upward speed of `paw_arrays`, for `update`."""
+        """Return the task's arrays and, from `paw_arrays`, paw contacts, paw positions and the base's upward speed."""
         return env.task_arrays() | paw_arrays(env)
 
     def record_step(self, env: Env) -> bool:
@@ -321,12 +325,12 @@ class JumpLog(EvaluationLog):
 
     @property
     def landing(self) -> np.ndarray:
-        """Base position at the end of each jump [m], in the frame of the goal's x and y, (..., 2)."""
+        """Base position when each jump ended [m], ahead and to the left of the jump's start like `goals`, (..., 2)."""
         return self.goals[..., :2] + turn_plane(self.end_position - self.goal_world, -self.heading)
 
     @property
     def ends(self) -> np.ndarray:
-        """End of each jump, (num_envs, jumps in a row): SUCCESS, another outcome, NO_END or NOT_BEGUN."""
+        """How each jump ended, (num_envs, jumps in a row): name of a termination, NO_END or NOT_BEGUN."""
         return np.where(np.isnan(self.heading), NOT_BEGUN, np.array([*self.terminations, NO_END])[self.end])
 
     @property
@@ -341,7 +345,7 @@ class JumpLog(EvaluationLog):
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of each jump's outcome: SUCCESS, early, missed, not_at_rest, or its entry in `ends`."""
+        """Outcome of each jump: success, early, missed or not_at_rest if it landed, else how it ended, see `ends`."""
         names = self.outcome.names
         return np.where(names == "", self.ends, names)
 

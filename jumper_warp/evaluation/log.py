@@ -25,7 +25,7 @@ NO_END = "no_end"  # Outcome of an episode that had not ended within the simulat
 
 
 class EvaluationLog(ABC):
-    """Base class of logs that command one episode per world and record its outcome, driven by `run_evaluation`."""
+    """Base class of logs that set the commands of one episode per world and record outcomes, see `run_evaluation`."""
 
     row_name = "jump"  # Noun for a trial; names the recording
     main_columns: Sequence[str] = ()  # Names of the columns in the summary of `jumper play`; empty: all
@@ -52,10 +52,16 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def series(self) -> dict[str, np.ndarray]:
-        """Return values to plot of all worlds, (num_envs,) each, by name `group/quantity, {} [unit]`; {}: the world."""
+        """Return the current values to plot of all worlds, (num_envs,) each, by name `group/quantity, {} [unit]`.
+
+        {} stands for the name of a world, see `named`.
+        """
 
     def states(self) -> dict[str, np.ndarray]:
-        """Return current states of all worlds as text, (num_envs,), such as phases of jumps, by `quantity/{}`."""
+        """Return current states of all worlds as texts, (num_envs,), such as phases of jumps, by name `quantity/{}`.
+
+        {} stands for the name of a world, see `named`.
+        """
         return {}
 
     def marks(self) -> dict[str, np.ndarray]:
@@ -67,7 +73,7 @@ class EvaluationLog(ABC):
         return {}
 
     def all_commands(self) -> np.ndarray | None:
-        """Return all worlds' commands (..., 3), to compare with their ranges in training; None: they have no ranges."""
+        """Return all worlds' commands (..., 3), to compare with ranges of training; None: there are no ranges."""
         return None
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
@@ -140,7 +146,7 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
 
 
 def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:
-    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: noun for the trials."""
+    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: what the trials are."""
     return {f"{prefix}{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
 
 

@@ -95,7 +95,7 @@ class EnvRecorder:
 
 
 def save_recording(recording: Recording, folder: Path, name: str, eye: Sequence[float] | None = None) -> Path:
-    """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the first.
+    """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the .rrd path.
 
     eye: direction of the picture's camera from the robot, as in `write_picture`.
     """
@@ -117,9 +117,10 @@ def block_positions(sim: Simulation) -> np.ndarray:
 
 
 def peak_forces(sim: Simulation) -> np.ndarray:
-    """Return the largest force on each paw in the last policy step [N], (num_worlds, 4, 3), world axes, legs as LEGS.
+    """Return the largest force on each paw in the last policy step [N], (num_worlds, 4, 3), world axes.
 
-    Its direction is that of the last physics step; upward if the paw was then in the air.
+    Paws are in the order of LEGS. A force's direction is that of the last physics step; upward if the paw was then in
+    the air.
     """
     force = sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
     size = np.linalg.norm(force, axis=2, keepdims=True)

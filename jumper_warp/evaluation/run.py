@@ -80,7 +80,7 @@ def conditions_of(args: EvaluationArgs) -> Conditions:
 
 
 class Run(ABC):
-    """Base class of evaluations: runs episodes, records some worlds, reports metrics; subclasses provide the actor."""
+    """Base class of evaluations: runs and records episodes, reports metrics; subclasses define `actor`, the policy."""
 
     folder: Path  # Output folder, set by `prepare`
     source: str | Path = "several policies"  # Name or folder of a policy, a run's folder, or a checkpoint
@@ -99,7 +99,10 @@ class Run(ABC):
         self._physics_dt = PHYSICS_DT
 
     def prepare_from(self, name: str, args: EvaluationArgs) -> Self:
-        """Call `prepare` with the flags of an experiment, and return the run itself; name: of the output folder."""
+        """Set the conditions and create the output folder from an experiment's flags, and return the run itself.
+
+        name: of the output folder, see `prepare`.
+        """
         self.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
         self.print_flags = args
         return self
@@ -152,7 +155,7 @@ class Run(ABC):
         return values
 
     def note_robot(self, env: Env) -> None:
-        """Store an environment's robot overlay (file of the robot) and randomisation ranges for the report."""
+        """Store, for the report, an environment's robot overlay (values of one robot) and randomisation ranges."""
         if env.overlay is None:
             return
         if self.conditions.robot is None:
@@ -284,7 +287,7 @@ class SkillRun(Run):
         self.skills = SkillPolicies(names)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function that returns the actions of all skills, (skills, num_envs, 12).
+        """Return a function that computes the actions of all skills, (skills, num_envs, 12), from the state of `env`.
 
         Its argument is ignored: every skill reads its own observation of `env`.
         """
@@ -327,6 +330,6 @@ def latency_text(steps: np.ndarray, physics_dt: float) -> str:
 
 
 def torque_limit(env: Env) -> float:
-    """Return the smallest torque limit of the transversal motors [N m], scaled by a robot overlay if there is one."""
+    """Return the smallest torque limit [N m] of the outer and inner (transversal) motors, robot overlay included."""
     limit = env.task.motors.transversal.saturation
     return limit if env.sim.robot is None else limit * float(env.sim.robot.saturation[:, TRANSVERSAL].min())

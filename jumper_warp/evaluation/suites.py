@@ -108,7 +108,7 @@ class Ring(Suite):
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run the jumps, plot landing positions, return the metrics, with three rates per quarter of the ring."""
+        """Run the jumps, plot landing positions, return metrics, with success, fall and miss rates by quarter."""
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
@@ -122,7 +122,7 @@ class Ring(Suite):
 
 @dataclass(frozen=True)
 class Consecutive(Suite):
-    """Jumps in a row, each commanded a second after the last touchdown: the paper's pairs, and ten to random goals.
+    """Jumps in a row, each commanded 1 s after the previous touchdown: two to the paper's goals, ten to random goals.
 
     A goal is relative to the robot's position and heading when the jump is commanded. Robots differ in heading and in
     the delay of the first command. After a fall or a collision no further jump counts. `row_all_landed_rate` is the
@@ -164,7 +164,7 @@ class Consecutive(Suite):
 
 
 def running_positions(jumps: JumpLog) -> np.ndarray:
-    """Return the base positions x, y [m] of robots that still jump, (worlds, 2), world frame; NaN for the others."""
+    """Return the current base positions x, y [m], (worlds, 2), world frame; NaN if a robot's last jump has ended."""
     running = jumps.current < jumps.goals.shape[1]
     return np.where(running[:, None], jumps.arrays["base_pos"][:, :2], np.nan)
 
@@ -227,7 +227,7 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def outlines(self, goals: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the outlines in plots by scene, title and corners [m]: platform, block, level ground among bumps."""
+        """Return the outline that each scene's plot shows, (title, corners [m]): platform, level circle or block."""
         x, y = np.median(goals, axis=0)
         block = rectangle(self.edge, x + BLOCK_BEYOND, y - 0.5 * BLOCK_WIDTH, y + 0.5 * BLOCK_WIDTH)
         level = regular_polygons(np.zeros((1, 2)), FLAT_RADIUS)

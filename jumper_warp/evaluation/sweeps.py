@@ -38,7 +38,7 @@ PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's trainin
 
 @dataclass(frozen=True)
 class Suite(EvaluationArgs, ABC):
-    """Test suite of jumping policies: its flags (also those of `EvaluationArgs`), runs and metrics."""
+    """Base class of the test suites of jumping policies; the fields, also of `EvaluationArgs`, are their flags."""
 
     num_jumps: int = 200  # Number of jumps (per scene, bin or goal of a grid, where there are several)
     rest_time: float = REST_TIME  # [s] Time from touchdown to the end of a jump
@@ -207,7 +207,7 @@ class DistanceSweep(Sweep):
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
     def metrics(self, log: JumpLog) -> Metrics:
-        """Return the metrics of `jumper evaluate`, and the success rate over the paper's range of training."""
+        """Return the metrics of `jumper evaluate`, and the success rate over the distances of the paper's training."""
         inside, success = within(log.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
         note = "over 0.4 to 1 m"
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)

@@ -62,7 +62,7 @@ class VelocityLog(EvaluationLog):
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
     def begin(self, env: Env) -> None:
-        """Reset every robot to the default pose, with its first command and the gait phase of the task's reset."""
+        """Reset every robot to the default pose, with its first command and the task's gait frequency."""
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         self._command = self._slewed(self._command, self.commands[:, 0])
@@ -137,7 +137,10 @@ class VelocityLog(EvaluationLog):
         return np.array(history[1:])
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over the walk, end."""
+        """Return one value per robot by name: first command, RMS tracking errors over the walk, outcome.
+
+        Keys: command_<axis>, rms_error_<axis>, end (outcome), for AXES.
+        """
         total, count = np.moveaxis(square_sums(self.errors()), -1, 0)
         error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
@@ -146,7 +149,7 @@ class VelocityLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Masks (robots,) that select the robots over which a metric is computed, by name."""
+        """Sets of robots from which metrics are computed: a mask (robots,) by the set's name, such as "robots"."""
         stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
@@ -195,7 +198,7 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def velocity_series(velocity: np.ndarray, command: np.ndarray) -> dict[str, np.ndarray]:
-    """Return velocities and commands of all robots, (robots, 3) each, in the form of `EvaluationLog.series`."""
+    """Return velocities and commands, (robots, 3) each, as series to plot, named as by `EvaluationLog.series`."""
     series = {}
     for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
         series |= {f"{axis}/actual, {{}} [{unit}]": velocity[:, i], f"{axis}/command, {{}} [{unit}]": command[:, i]}
@@ -203,7 +206,7 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray) -> dict[str, np.n
 
 
 def square_sums(error: np.ndarray) -> np.ndarray:
-    """Sum squared tracking errors over time, and count them, without NaN: (robots, 3, 2).
+    """Return the sum over time of squared tracking errors, and their number, both without NaN, (robots, 3, 2).
 
     error: (steps, robots, 3).
     """
@@ -270,7 +273,7 @@ class VelocityFlags:
         return VelocityLog(np.concatenate([commands, commands, standing]), task, self.seconds, times=times, slew=slew)
 
     def metrics(self, log: VelocityLog) -> Metrics:
-        """Return tracking errors, drift and fall rate of a finished log of walks, VELOCITY_METRICS."""
+        """Return tracking errors, drift and fall rate of a finished log of walks, as in VELOCITY_METRICS."""
         return measure(VELOCITY_METRICS, log)
 
 
@@ -291,7 +294,7 @@ class VelocityPlayFlags:
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
-        """Sequence of commands: those of the flag, or the default."""
+        """Velocities commanded in sequence: `velocity` if passed, else `default_velocities`."""
         return self.velocity or self.default_velocities
 
     @property

@@ -28,7 +28,7 @@ FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 
 @dataclass
 class Progress:
-    """Best candidate so far that an optimisation found from each of its starts, and its history."""
+    """Best candidate that an optimisation has found so far from each of its starts, and the optimisation's history."""
 
     x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
     objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible
@@ -94,7 +94,7 @@ class _Descent:
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian of candidates, which the descent minimises, (starts * repeat,)."""
+        """Return the augmented Lagrangian of candidates, the function to minimise, (starts * repeat,)."""
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)

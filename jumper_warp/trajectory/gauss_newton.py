@@ -80,7 +80,7 @@ class Network:
 
 
 def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
-    """Return the gradient of each world's loss w.r.t. the weights, (worlds, num_weights), as `Network.weights`.
+    """Return the gradient of each world's loss w.r.t. `Network.weights`, (worlds, num_weights).
 
     total: scalar sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
     tape: of all policy steps, filled by `Network.act`.

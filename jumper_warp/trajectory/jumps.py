@@ -67,7 +67,10 @@ def highest() -> Term:
 
 
 def positive_work() -> Term:
-    """Return the objective of saving energy: the motors' positive work until takeoff (0.25 m/s), in units of 100 J."""
+    """Return the objective of saving energy: the motors' positive work until takeoff, in units of 100 J.
+
+    Takeoff is `SimulatedMotion.takeoff` at 0.25 m/s.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         row = motion.takeoff(0.25)[0]
@@ -129,9 +132,9 @@ def drifts(limit: float) -> Term:
 
 
 def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
-    """Return the constraint that housings, thighs, knees and shanks are `margin` [m] above ground, scaled to 0.1 m.
+    """Return the constraint that housings, thighs, knees and shanks stay at least `margin` [m] above the ground.
 
-    speed [m/s]: only the rows before this takeoff count; None: all rows.
+    It is scaled to 0.1 m. speed [m/s]: only the rows before this takeoff count; None: all rows.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -154,9 +157,9 @@ def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Return the constraint that the robot takes off, else by how far the lowest paw is below `lift` [m] at the end.
+    """Return the constraint that the robot takes off; without takeoff its value falls as the lowest paw rises.
 
-    The second condition has a gradient; its value is scaled to 0.1 m and stays above 0.
+    That value, which has a gradient, is how far the paw is below `lift` [m] at the end, scaled to 0.1 m, plus 0.01.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -207,9 +210,10 @@ def soft(limit: float, speed: float = 0.25) -> Term:
 
 
 def lifted(dead_band: float = 0.001) -> Term:
-    """Return the objective that penalises paws that lift again after touchdown: height over time, unit 10 mm s.
+    """Return the objective that penalises lifting paws again after touchdown: time integral of their height.
 
-    Heights are counted above `dead_band` [m]. Each paw's height in the last row is added in units of 10 mm.
+    The integral is in units of 10 mm s. Heights are counted above `dead_band` [m]. Each paw's height in the last row is
+    added in units of 10 mm.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Trajectory optimisation problems: motor targets, an objective and constraints, with gradients of the simulation.
+"""Optimisation problems of motor targets over time, with gradients that are computed through the simulation.
 
 Targets are knots over time, interpolated to policy steps. Every candidate is a world of one rollout. A problem is
 
@@ -32,7 +32,7 @@ CONTACT_FORCE = 0.1  # [N] force above which a paw is in contact
 
 @dataclass(frozen=True)
 class Knots:
-    """Description of motor targets over time by few numbers: actions within ±1 at knots, linear in between."""
+    """Parametrisation of motor targets over time: actions within ±1 at knots, interpolated linearly between them."""
 
     at: tuple[float, ...]  # Policy steps of the knots, rising from 0
     steps: int  # Policy steps of the motion
@@ -63,7 +63,10 @@ class Knots:
         return np.stack([np.interp(np.arange(self.steps), self.at, unit) for unit in np.eye(len(self.at))], axis=1)
 
     def targets(self, x: torch.Tensor) -> torch.Tensor:
-        """Return motor targets [rad] (steps, 12, n) of candidates x (n, len(self)), within ±1, knot by knot."""
+        """Return motor targets [rad] (steps, 12, n) of candidates x (n, len(self)), actions within ±1.
+
+        x: the `motors` actions of the first knot, then those of the second, and so forth.
+        """
         weights = torch.as_tensor(self.weights, dtype=x.dtype, device=x.device)
         actions = torch.einsum("tk,nkm->tmn", weights, x.unflatten(1, (len(self.at), self.motors)))
         if self.symmetric:

@@ -1,4 +1,4 @@
-"""Global trajectory optimisation by descent along smoothed gradients, from many sampled starts at once.
+"""Global trajectory optimisation by gradient descent at randomly displaced points, from many starts at once.
 
 Contacts that begin and end make an objective rough at small scales, where its exact gradient is large and useless. The
 descent follows gradients at randomly displaced points, one per step, whose running mean is the gradient of the
@@ -29,7 +29,7 @@ MAX_VIOLATION = 0.05  # [1] clip of the violations that raise multipliers
 
 @dataclass(frozen=True)
 class Stage:
-    """Settings of one stage of an optimisation by smoothed descent."""
+    """Settings of one stage of the optimisation `smoothed`: starts, steps, random displacements, penalties."""
 
     keep: int  # Number of best starts that enter the stage
     iterations: int  # Gradient steps of the stage
@@ -47,7 +47,7 @@ class Stage:
     """Number of crossings by start, of which the best replaces the start before the stage, see `crossed`."""
 
     def merit(self, values: Values) -> torch.Tensor:
-        """Return the merit (n,) that ranks candidates, lower is better: `exact` if `dual`, else `penalised`."""
+        """Return the merit (n,) that ranks candidates, lower is better: `penalised`, or `exact` if `dual` is not 0."""
         return exact(values) if self.dual else penalised(values, self.penalty)
 
 
@@ -92,7 +92,7 @@ def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> tor
 
 
 def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
-    """Return new starts of the search that join the first knots of one start to the last knots of a random other.
+    """Return new starts, each of which joins the first knots of a start to the last knots of another, random one.
 
     Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
     shifted in time by up to `SHIFT` knots.
@@ -129,7 +129,7 @@ class _BestPoints:
         self.x, self.merit = x, merit_of(problem, x, stage.merit)
 
     def update(self, x: torch.Tensor, slack: float) -> torch.Tensor:
-        """Store points x (n, len(knots)) that improve; return whether each is worse than its best by over `slack`."""
+        """Store improved points x (n, len(knots)); return whether each is worse than its best by more than `slack`."""
         merit = merit_of(self.problem, x, self.stage.merit)
         better = merit < self.merit
         self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)
@@ -137,7 +137,10 @@ class _BestPoints:
 
 
 def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
-    """Run one stage of smoothed descent from starts x (n, len(knots)); return last points, or with `slack` the best."""
+    """Run one stage of gradient descent from starts x (n, len(knots)), and return a point for each start.
+
+    Gradients are those at randomly displaced points. Returned are the last points or, with finite `slack`, the best.
+    """
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     best = _BestPoints(problem, x, stage) if stage.slack < inf else None
     multipliers, scale = _first_multipliers(problem, x, stage), x.new_ones(len(x), 1)
@@ -171,7 +174,7 @@ def smoothed(
     seed: int = 0,
     callback: Callable[[int, torch.Tensor], None] | None = None,
 ) -> np.ndarray:
-    """Minimise a trajectory optimisation problem by smoothed descent in several stages.
+    """Minimise a trajectory optimisation problem by gradient descent at randomly displaced points, in several stages.
 
     Returned: candidates, lowest merit first, (keep of the last stage, len(problem.knots)). begin: candidates (n,
     len(problem.knots)), of which the first stage keeps the best. callback: called after each stage with its index and

@@ -244,9 +244,9 @@ class WholeBody:
         return world[..., :5, :], world[..., 5, :]
 
     def clearance(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the heights [m] of each leg's links above level ground, negative inside, (..., 4 legs, 4 kinds).
+        """Return the heights [m] of each leg's housing, thighs, knees and shanks above level ground, (..., 4 legs, 4).
 
-        Kinds: housing, thighs, knees, shanks without paw; each is the minimum over the shapes of this kind in
+        They are negative in the ground; the shanks are without paw. Each is the minimum over the shapes of its kind in
         `jumper_warp.kernels.collision.robot`. q: (..., 19).
         """
         return self.clearance_of(q, *self.points(q))

@@ -60,7 +60,7 @@ class Composition:
 
     @property
     def stays(self) -> bool:
-        """Whether the robot stays in place: the picture's horizontal axis is the order of the moments, not to scale."""
+        """Whether the robot stays in place, so that its drawings are side by side in order of time, not to scale."""
         return bool(self.shift.any())
 
     @property
@@ -76,7 +76,7 @@ class Composition:
 
     @property
     def lowest(self) -> float:
-        """Lowest height of a paw in the recording [m], 0 if it has no paws."""
+        """Lowest height of a paw in the recording [m]; 0 if no paws are recorded."""
         points = self.recording.contact_points[:, self.rank, :, 2]
         return float(points.min()) if points.size else 0.0
 

@@ -222,7 +222,7 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Seq
 
 
 def path_limits(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits [m] of both axes around paths [m], (paths, steps, 2); the height is at least width / 5."""
+    """Return x and y limits [m] of a plot of paths [m], (paths, steps, 2); the y range is at least x range / 5."""
     low, high = (limit(paths, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
     middle, size = 0.5 * (low + high), np.maximum(1.1 * (high - low), 0.2)
     size[1] = max(size[1], 0.2 * size[0])

@@ -67,7 +67,7 @@ class Recording:
         return self.labels[rank] if self.labels else f"world_{self.worlds[rank]}"
 
     def heading(self, ranks: Sequence[int]) -> str:
-        """Return the title of a picture or film: policy and task of the notes, and the name of a single world."""
+        """Return the title of a picture or film: policy and task from `notes`, and the world if it is only one."""
         policy, task = (str(self.notes.get(key, "")) for key in ("policy", "task"))
         same = not policy or policy.replace("_", "-") == task
         words = [
@@ -81,7 +81,7 @@ class Recording:
         return self.poses[:, self.body_indices(rank)]
 
     def body_indices(self, rank: int) -> list[int]:
-        """Return the indices in `bodies` of the rank-th recorded world."""
+        """Return the indices in `bodies` of the bodies of the rank-th recorded world."""
         prefix = f"world_{self.worlds[rank]}/"
         return [i for i, body in enumerate(self.bodies) if body.startswith(prefix)]
 

@@ -88,9 +88,10 @@ class Renderer(ABC):
         self.load(shapes, num_bodies, opacity)
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """Load copies of bodies to be drawn; shapes that are fixed to the world exist once.
+        """Load the bodies to draw, one copy of all bodies for each entry of `opacity`.
 
-        num_bodies: number of bodies that `ShapeMesh.body` indexes. opacity: of each copy, 0 to 1.
+        Shapes that are fixed to the world are loaded once. num_bodies: number of bodies that `ShapeMesh.body` indexes.
+        opacity: of each copy, 0 to 1.
         """
         self.model = _scene_model(shapes, num_bodies, opacity)
         self.state: State = self.model.state()
@@ -148,7 +149,7 @@ class GLRenderer(Renderer):
         renderer.line_width, renderer.arrow_scale = LINE_WIDTH * size[0], 0.6 * LINE_WIDTH * size[0]
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """Load copies of bodies to be drawn; see `Renderer.load`."""
+        """Load the bodies to draw into OpenGL's viewer; arguments: see `Renderer.load`."""
         super().load(shapes, num_bodies, opacity)
         self._viewer.renderer._make_current()
         self._viewer.set_model(self.model)
@@ -189,7 +190,7 @@ class RayTracer(Renderer):
         self._field_of_view = 0.0  # [deg] of `_rays`
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """Load copies of bodies to be drawn; see `Renderer.load`."""
+        """Load the bodies to draw, and prepare light, sky and image; arguments: see `Renderer.load`."""
         from newton.sensors import SensorCamera  # takes half a second, which OpenGL does not need
 
         super().load(shapes, num_bodies, opacity)
@@ -235,7 +236,7 @@ def open_renderer(
 
 
 def opengl_name() -> str:
-    """Return version and renderer of OpenGL without a display.
+    """Return version and renderer name of the OpenGL that is available without a display.
 
     Raises ImportError: pyglet is missing; RuntimeError: no OpenGL.
     """

@@ -52,7 +52,7 @@ def without_divergence(recording: Recording) -> Recording:
 
 
 def body_paths(recording: Recording, ranks: Sequence[int]) -> np.ndarray:
-    """Return base positions as drawn [m], (num_frames, worlds, 3): world frame, consecutive worlds apart in y.
+    """Return base positions as drawn [m], (num_frames, worlds, 3), world frame; worlds are side by side along y.
 
     A robot whose simulation diverges keeps its last valid position, or the origin.
     """
