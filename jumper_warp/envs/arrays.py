@@ -1,4 +1,4 @@
-"""Kernel arrays of an environment, and checks of its arguments."""
+"""Allocation of an environment's kernel arrays, and checks of arguments such as tasks, actions and commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def allocate(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], dt
 
 
 def robot_arrays(sim: Simulation, step_dt: float) -> Any:
-    """Return the arrays of all robots' states that the kernels use: views of a simulation's arrays, and new ones.
+    """Return the kernels' `RobotArrays`: views of a simulation's state and forces, and new arrays for paws and motors.
 
     step_dt [s]: policy step.
     """
@@ -91,8 +91,9 @@ def scene_of(sim: Simulation) -> Any:
 
 
 def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
-    """Check that tasks fit one environment, and return them as a tuple; task: a `TaskCfg` or several.
+    """Check the tasks and handovers (switches between tasks) of one environment, and return the tasks as a tuple.
 
+    task: a `TaskCfg` or several.
     Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
     torque, over-speed protection or gravity; or a handover refers to another task.
     """
@@ -121,7 +122,7 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 def prepared_tasks(
     tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool, robot: RobotOverlay | None = None
 ) -> tuple[tuple[TaskCfg, ...], bool]:
-    """Return tasks with an environment's randomisation and noise options applied, and whether any samples its ground.
+    """Return tasks with an environment's randomisation and noise options applied, and whether resets sample the ground.
 
     Without randomize tasks are nominal, with it they have the ranges of the overlay `robot`. Without noise their
     observations are exact. Ground is sampled only with randomize and ground_may_vary.
@@ -158,7 +159,10 @@ def to_numpy(values: Any) -> Any:
 
 
 def as_float32(values: Any, name: str) -> np.ndarray:
-    """Return values as a float32 array; name: for the message. Raises InputError: no rectangular array of numbers."""
+    """Return a number, list, array or tensor as a float32 array; `name` is used in the error message.
+
+    Raises InputError: no rectangular array of numbers.
+    """
     values = to_numpy(values)
     try:
         return np.asarray(values, dtype=np.float32)
@@ -177,7 +181,10 @@ def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray
 
 
 def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
-    """Return a checked task index for each world, (num_envs,) int32; skill: one, or (num_envs,). Raises InputError."""
+    """Check task indices, and return one for each world, (num_envs,) int32.
+
+    skill: one index for all worlds, or (num_envs,). Raises InputError: not integers from 0 to num_skills - 1.
+    """
     array = np.asarray(skill)
     if array.shape not in ((), (num_envs,)) or array.dtype.kind not in "iu":
         raise InputError(f"skill must be one int or {num_envs} ints, got {array.dtype} of shape {array.shape}")
@@ -187,7 +194,10 @@ def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
 
 
 def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return selected worlds as a float32 mask; worlds: (num_envs,) bool or None for all. Raises InputError."""
+    """Convert a bool mask of worlds, (num_envs,) or None for all, to a float32 mask, 1 in selected worlds.
+
+    Raises InputError: another shape or type.
+    """
     if worlds is None:
         return np.ones(num_envs, dtype=np.float32)
     array = np.asarray(to_numpy(worlds))
@@ -197,7 +207,10 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 
 def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return the selected worlds as a float32 mask; worlds: (num_envs,) bool or distinct indices. Raises InputError."""
+    """Convert a bool mask, (num_envs,), or distinct indices of worlds to a float32 mask, 1 in selected worlds.
+
+    Raises InputError: neither of them.
+    """
     array = np.asarray(to_numpy(worlds))
     if array.dtype.kind not in "iu":
         return checked_mask(array, num_envs)
@@ -210,7 +223,7 @@ def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
 
 
 def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
-    """Check commands of tasks, and return them as float32 (num_envs, 4), padded with 0.
+    """Check that commands are valid for a task, and return them as float32 (num_envs, 4), padded with zeros.
 
     mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.

@@ -28,7 +28,7 @@ BELOW = -1000.0  # [m] height of the scenery of worlds that are not being drawn
 
 
 class WorldCamera:
-    """Camera for the first worlds of a simulation, with their ground and blocks; it does not change the simulation.
+    """Camera that draws a simulation's first worlds, each with robot, ground and blocks, without changing them.
 
     All worlds share a renderer, which opens at the first image and holds one robot and the scenery of every world. It
     loads the scenery again when a block changes its size, or a robot on a heightfield moves by more than NEAR.

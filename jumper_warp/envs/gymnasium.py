@@ -29,7 +29,7 @@ RENDERING: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):
-    """`Env` of one task as a Gymnasium vector environment; returns copies.
+    """Gymnasium vector environment made from an `Env` with one task; later steps do not change returned values.
 
     Infos by `autoreset_mode`; masks such as `_final_obs` (num_envs,) mark the worlds whose episode ended in the step:
         SAME_STEP: a step that ends an episode also resets it, which is fastest. When one ended, the infos have

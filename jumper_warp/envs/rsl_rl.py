@@ -23,7 +23,7 @@ class EnvConfig(dict):
 
 
 class RslRlVecEnv(RslRlEnv):
-    """Adapter of a `VecEnv` to rsl-rl's `VecEnv`; returns copies, as rsl-rl keeps references over the next step."""
+    """Adapter of this package's `VecEnv` to rsl-rl's class of that name; returns copies, since rsl-rl keeps them."""
 
     cfg: EnvConfig
 
@@ -44,7 +44,7 @@ class RslRlVecEnv(RslRlEnv):
 
     @property
     def unwrapped(self) -> RslRlVecEnv:
-        """The adapter itself, where rsl-rl looks for `step_dt`."""
+        """The adapter itself; rsl-rl reads the duration of a policy step as `unwrapped.step_dt`."""
         return self
 
     @property
@@ -53,7 +53,7 @@ class RslRlVecEnv(RslRlEnv):
         return self.cfg["policy_dt_s"]
 
     def write_config(self, folder: str | Path, activation: str = "elu") -> None:
-        """Write `config.json`, by which the checkpoints in a log folder of rsl-rl are evaluated, played and exported.
+        """Write `config.json` (environment, activation), needed to evaluate, play and export rsl-rl's checkpoints.
 
         folder: made if it is missing; activation: of the actor's network. Raises OSError: the file cannot be written.
         """
@@ -63,7 +63,7 @@ class RslRlVecEnv(RslRlEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Policy steps of each running episode, (num_envs,) int64; assigned values are copied and change no episode."""
+        """Count of policy steps in each running episode, (num_envs,) int64; assigning it does not affect their ends."""
         return self._episode_length
 
     @episode_length_buf.setter

@@ -77,7 +77,7 @@ class Sb3VecEnv(VecEnv):
         return [getattr(self.envs, method_name)(*method_args, **method_kwargs)] * self._count(indices)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for each of the worlds `indices`, by default all."""
+        """Return False for each of the worlds `indices`, by default all, as no world has a wrapper of its own."""
         return [False] * self._count(indices)
 
     def _count(self, indices: Any) -> int:

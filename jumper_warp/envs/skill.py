@@ -123,7 +123,7 @@ class TaskRuntime:
         self.found, self.found_states = found, wp.zeros(rows, dtype=task.state, device=self.device)
 
     def non_finite(self) -> list[NonFiniteValue]:
-        """Return the first non-finite value of each term, once per term (waits for the device)."""
+        """Return the first non-finite value of each term, without terms of earlier calls (waits for the device)."""
         worlds = self.found.world.numpy().reshape(-1, self.found.num_terms)  # (slices, terms)
         terms = [i for i in np.flatnonzero((worlds != NO_WORLD).any(0)).tolist() if i not in self._reported]
         if not terms:
@@ -167,7 +167,10 @@ class TaskRuntime:
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:
-        """Change parameters, such as a weight, of term `section.name`; raises InputError as `Env.set`."""
+        """Change parameters of one of the task's terms, such as its weight.
+
+        section: kind of term, as "rewards"; name: of the term. Raises InputError as `Env.set`.
+        """
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
@@ -220,7 +223,7 @@ class TaskRuntime:
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
-    """Return a task's kernels by name, each built by its `make_<name>_kernel`; it compiles nothing.
+    """Return a task's kernels by name, built by `make_<name>_kernel` and cached, without compiling them.
 
     Names: step, reset, set_command, observe, event. Tasks that differ only in numbers share kernels.
     """

@@ -42,7 +42,7 @@ EVENT_BLOCKS = 264
 
 
 def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, int]]:
-    """Return the kernels that environments of given tasks launch, each with its block size; the slowest compile first.
+    """Return the kernels that any environment of given tasks launches, with block sizes; the slowest compile first.
 
     draws: include those of `reset`, else those of `evaluation_reset`.
     """
@@ -104,7 +104,7 @@ class Stages:
         ]
 
     def after_load_state(self) -> None:
-        """Update start flag, term parameters and solver after `load_state` wrote the environment's arrays.
+        """Update the flag `_started`, term parameters and solver after `load_state` wrote the environment's arrays.
 
         Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
         """
@@ -114,7 +114,7 @@ class Stages:
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return the kernels of `step` and of `reset` (draws) or `evaluation_reset`, each with its block size."""
+        """Return the kernels of `step`, and of `reset` if draws, else `evaluation_reset`, each with its block size."""
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]

@@ -1,4 +1,4 @@
-"""Protocols of the environments that PPO and SHAC train on, and bounds of observations."""
+"""Protocols of the environments that PPO and SHAC train on, and `sanitise`, which makes observations finite."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class VecEnv(Protocol):
         """
 
     def metrics(self) -> dict[str, float]:
-        """Return metrics by name of the episodes that ended since the last call (waits for the device)."""
+        """Return the training metrics since the last call, by name (waits for the device)."""
         ...
 
     def config(self) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class VecEnv(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a saved state of the environment, so that the following steps, without a `reset`, are the same.
+        """Restore a state that `state_dict` returned; later steps without a `reset` repeat those after the saving.
 
         Raises ValueError: the state does not fit this environment.
         """
@@ -80,7 +80,7 @@ class MirroredVecEnv(Protocol):
 
 
 class DifferentiableVecEnv(VecEnv, Protocol):
-    """Environment for SHAC: observations and rewards are differentiable with respect to earlier actions of a window.
+    """Environment for SHAC: observations and rewards are differentiable with respect to actions since `begin_window`.
 
     A window is a call of `begin_window`, then `observe` and `step_with_gradient` in turn. Values are those of `obs`,
     `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in every call.
@@ -98,7 +98,7 @@ class DifferentiableVecEnv(VecEnv, Protocol):
         ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance one policy step, with resets; return the reward (num_envs,), differentiable where its terms are."""
+        """Advance one policy step, with resets; return rewards (num_envs,), with gradients of differentiable terms."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Plausibility checks of a robot description, which reveal wrong units; bounds allow robots that carry a person."""
+"""Range checks of a robot description's values, to detect wrong units; robots may be large enough to carry a person."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def check_bounds(description: RobotDescription) -> None:
 
 
 def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
-    """Raise RobotDescriptionError for the first value outside its range or NaN; file, part: where the value is."""
+    """Raise RobotDescriptionError, which names file and part, for the first value that is NaN or outside its range."""
     for name, value, (low, high, unit) in checks:
         if not low <= value <= high:
             problem = f"{name} must be between {low:.4g} and {high:.4g}{unit and ' '}{unit}, got {value:.6g}"
@@ -101,7 +101,10 @@ def joint_checks(joint: Joint) -> Iterator[RangeCheck]:
 
 
 def link_checks(link: Link, anchors: list[np.ndarray]) -> Iterator[RangeCheck]:
-    """Yield the range checks of a link's mass, shapes, size and inertia; anchors: points (3,) [m] of the link."""
+    """Yield the range checks of a link's mass, shapes, size and inertia.
+
+    anchors: points (3,) [m], link frame, at which joints and loops attach to the link.
+    """
     yield RangeCheck("mass", link.mass, LINK_MASS)
     yield from point_checks("centre of mass", link.com)
     for shape in (*link.visuals, *link.collisions):
@@ -127,7 +130,7 @@ def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
 
 
 def shape_corners(shape: Shape) -> np.ndarray:
-    """Return the corners (8, 3) [m], in the link frame, of the box around a shape, along the shape's own axes."""
+    """Return the corners (8, 3) [m], in the link frame, of a shape's bounding box along the shape's own axes."""
     if shape.mesh is not None:
         low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
     else:
@@ -142,7 +145,7 @@ def shape_corners(shape: Shape) -> np.ndarray:
 
 
 def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
-    """Yield the range checks of a motor type's constants, at the output of its gear, and of its two sets of gains."""
+    """Yield the range checks of a motor type's constants, and of its gains for jumping and walking."""
     yield RangeCheck("gear_ratio", motor.gear_ratio, GEAR_RATIO)
     yield RangeCheck("rotor_inertia", motor.rotor_inertia, ROTOR_INERTIA)
     yield RangeCheck("rotor_inertia behind the gear", motor.armature, ARMATURE)
@@ -157,7 +160,7 @@ def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
 
 
 def common_checks(description: RobotDescription) -> Iterator[RangeCheck]:
-    """Yield the range checks of knee damping and of the stops of outer + inner angle, which all legs share."""
+    """Yield the range checks of what all legs share: knee damping, and stops of the sum outer + inner thigh angle."""
     yield RangeCheck("knee_damping", description.knee_damping, KNEE_DAMPING)
     yield RangeCheck("knee_damping_limit", description.knee_damping_limit, KNEE_DAMPING_LIMIT)
     for name, angle in zip(("lower", "upper"), description.transversal_sum, strict=True):

@@ -1,4 +1,4 @@
-"""Checks of a whole robot description (tree, loops, legs, motors, poses), and the inverse kinematics of the knees."""
+"""Checks of a whole robot description (tree, loops, legs, motors, poses), and knee angles that close a leg's loop."""
 
 from __future__ import annotations
 
@@ -56,10 +56,11 @@ def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
 
 
 def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, float, float]:
-    """Return the outer and inner knee angles [rad] that close the loop, and the ankle's z in the housing frame [m].
+    """Return the outer and inner knee angles [rad] that close a leg's loop at given thigh angles, and ankle z [m].
 
     outer, inner: thigh angles [rad]. The ankle is the lower intersection of two circles of radius `shank` about the
-    knees; points below are (x, z) [m], housing frame. Raises InputError where the circles do not intersect.
+    knees. z, and points (x, z) [m] below, are in the housing frame (see `LegDimensions`). Raises InputError where the
+    circles do not intersect.
     """
     outer_knee = np.array([leg.outer_x + leg.front * leg.thigh * math.sin(outer), -leg.thigh * math.cos(outer)])
     inner_knee = np.array([leg.inner_x - leg.front * leg.thigh * math.sin(inner), -leg.thigh * math.cos(inner)])
@@ -91,7 +92,7 @@ def check_description(description: RobotDescription) -> RobotDescription:
 
 
 def in_tree_order(description: RobotDescription) -> RobotDescription:
-    """Sort the links and joints of a robot description in the order of `tree_layout`; refuse any other tree."""
+    """Return a description with links and joints in the order of `tree_layout`; refuse one with another tree."""
     file = description.urdf_path
     links = {link.name: link for link in description.links}
     joints = {joint.name: joint for joint in description.joints}
@@ -149,7 +150,7 @@ def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
 
 
 def check_leg(description: RobotDescription, leg: str) -> None:
-    """Raise RobotDescriptionError for a leg that is not a planar five-bar with the documented axes and a paw."""
+    """Raise RobotDescriptionError for a leg that is no planar five-bar with expected axes and a paw at the ankle."""
     file = description.urdf_path
     front, side = (1.0 if leg[0] == "F" else -1.0), (1.0 if leg[1] == "L" else -1.0)
     names = ("lateral", "outer", "inner", "outer_knee", "inner_knee")
@@ -220,7 +221,7 @@ def check_mirror(description: RobotDescription, leg: str) -> None:
 
 
 def check_motors(description: RobotDescription) -> None:
-    """Raise RobotDescriptionError for motors that differ between legs, or from their joint's limits by over 0.1 %."""
+    """Raise RobotDescriptionError for motor types that differ by leg, or joint limits over 0.1 % off the motor's."""
     for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
         kind = description.motors[index % 3].type
         problem = f"expected {kind} as on the FL leg, found {motor.type}"

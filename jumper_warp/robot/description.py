@@ -43,7 +43,7 @@ RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 def load_description(path: Path | None = None) -> RobotDescription:
-    """Read and check a robot description; without a path the project's, which is read once and cached.
+    """Read and check a robot description, by default the project's own, which is read once and cached.
 
     Raises RobotDescriptionError for anything missing, malformed or implausible.
     """
@@ -136,7 +136,10 @@ class JsonReader:
         return tuple(motors)
 
     def table_of(self, noun: str, names: Sequence[str]) -> dict:
-        """Return the JSON object that lists motors or loops (noun: singular); refuse names that are not in `names`."""
+        """Return the JSON object that lists motors or loops by name; refuse names that are not in `names`.
+
+        noun: "motor" or "loop".
+        """
         table = self.get(self.root, f"{noun}s", "", dict)
         for name in table:
             self.require(name in names, f"{noun} {name}", f"expected one of {', '.join(names)}")

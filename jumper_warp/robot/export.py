@@ -1,4 +1,4 @@
-"""Export of the robot to files of other simulators: MJCF, URDF with its loops, or USD."""
+"""Export of the robot to files for other simulators: MJCF, USD, or URDF with a YAML file of the closed loops."""
 
 from __future__ import annotations
 

@@ -121,7 +121,10 @@ def leg_geometry(description: RobotDescription) -> list[dict]:
 def leg_geometry_array(
     description: RobotDescription, geometry_module: ModuleType, device: wp.DeviceLike = None
 ) -> wp.array:
-    """Return the legs' geometry as an array (4,) of structs for the kernels; geometry_module: either precision."""
+    """Return the legs' geometry as an array (4,) of the kernels' struct `LegGeometry`.
+
+    geometry_module: kernel module that defines the struct, in single or double precision.
+    """
     legs = []
     for fields in leg_geometry(description):
         leg = geometry_module.LegGeometry()

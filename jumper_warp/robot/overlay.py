@@ -92,7 +92,7 @@ class RobotOverlay:
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
-        """Return all values of the overlay's robot (N = 1); values that it lacks come from the description."""
+        """Return the complete values of the overlay's one robot; values that it lacks come from the description."""
         robot = RobotValues.nominal(1, description)
         for name, values in self.values.items():
             getattr(robot, name)[0] = values
@@ -100,11 +100,11 @@ class RobotOverlay:
 
     @property
     def latency(self) -> float | None:
-        """Latency from target to motor [s]; None: not given."""
+        """Delay from a commanded target to its effect on the motor [s]; None if the overlay has no latency."""
         return self.values["latency"][0] if "latency" in self.values else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the overlay as the content of a JSON file, with the keys `SECTIONS`."""
+        """Return the overlay as JSON data, a dict with the keys `SECTIONS`."""
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -181,6 +181,6 @@ def load_overlay(path: Path) -> RobotOverlay:
 
 
 def overlay_of(values: RobotValues, quantities: tuple[str, ...], **fields: Any) -> RobotOverlay:
-    """Return an overlay with some quantities of the first robot in `values`; fields: other fields of the overlay."""
+    """Return an overlay with the named quantities of the first robot in `values`; fields: others of `RobotOverlay`."""
     selected = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
     return RobotOverlay(selected, **fields)

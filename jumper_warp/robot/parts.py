@@ -27,7 +27,7 @@ class RobotDescriptionError(InputError):
 
 
 def description_error(message: str) -> RobotDescriptionError:
-    """Return a RobotDescriptionError with a message that begins with the file."""
+    """Return a RobotDescriptionError made from a message of the form "FILE: PROBLEM"."""
     file, _, problem = message.partition(": ")
     return RobotDescriptionError(Path(file), "", problem)
 

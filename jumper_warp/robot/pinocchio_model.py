@@ -97,7 +97,7 @@ class PinocchioRobot:
         return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
-        """Return Pinocchio's velocity v, (26,), of base and motors, with knee rates that keep the loops closed.
+        """Return Pinocchio's velocity v, (26,), for given base and motor rates, with knee rates that keep loops closed.
 
         q: configuration (27,). base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity
         [rad/s], body frame. motor_rates: (12,) [rad/s], motor order.
@@ -113,7 +113,7 @@ class PinocchioRobot:
         return v
 
     def forward_dynamics(self, q: np.ndarray, v: np.ndarray, motor_torques: np.ndarray) -> np.ndarray:
-        """Return the acceleration of the robot in free flight under gravity, loops rigid, dv/dt, (26,).
+        """Return the acceleration dv/dt, (26,), of the robot in free flight under gravity, with its loops kept closed.
 
         The first six entries are time derivatives of the base's body-frame components: add omega x v to the linear
         three for the acceleration of the origin. q: (27,), loops closed; v: (26,), which keeps them closed;
@@ -145,7 +145,7 @@ class PinocchioRobot:
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
-    """Build the Pinocchio model of a described robot, by default the project's, with a free-flying base.
+    """Build the Pinocchio model of a robot description, by default the project's own, with a free-flying base.
 
     values: a robot that differs from the description, as `RobotOverlay.robots()` returns it. Of the first robot,
     `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature` are used.

@@ -77,7 +77,7 @@ class TerrainCfg:
 
 
 def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
-    """Build the terrain map of all tiles as a heightfield centred on the origin, its data with rows along y.
+    """Build the terrain map of all tiles as a heightfield centred on the origin, its data indexed [y, x].
 
     The tile of row i and column j has its middle at x = (i + 1/2 - rows/2) tile, y = (j + 1/2 - cols/2) tile.
     Raises InputError for a configuration without rows.
@@ -118,7 +118,7 @@ def check_kind(kind: str) -> None:
 
 
 def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the heights [m] of a terrain tile's nodes, (n, n), rows along y, 0 on its rim; difficulty: 0 to 1."""
+    """Return the heights [m] of a terrain tile's nodes, (n, n) indexed [y, x], 0 on its rim; difficulty: 0 to 1."""
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9) + 1
     axis = np.linspace(-0.5 * cfg.tile, 0.5 * cfg.tile, nodes)
     return _SHAPES[kind](_Tile(cfg, difficulty, rng, *np.meshgrid(axis, axis)))

@@ -1,4 +1,4 @@
-"""Strict reader of the URDF subset that the robot uses: hinge trees, exact inertias, simple shapes, OBJ meshes."""
+"""Strict reader of the URDF subset that the robot uses: hinge trees, inertia tensors, simple shapes, OBJ meshes."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class UrdfReader:
         return children[0]
 
     def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
-        """Return an XML attribute as a list of `count` finite numbers; default: text of a missing attribute."""
+        """Return an XML attribute as a list of `count` finite numbers; default: text used if it is missing."""
         text = element.get(attribute, default)
         try:
             values = [float(word) for word in text.split()]

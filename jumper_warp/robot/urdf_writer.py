@@ -1,4 +1,4 @@
-"""Writer of a URDF with a robot's own masses and motors, and of a YAML file with its closed loops."""
+"""Writer of a URDF with the masses and joint limits of a given robot, and of a YAML file with its closed loops."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOPS_HEADER = """\
 
 
 def urdf(robot: RobotDescription) -> str:
-    """Return the robot's URDF as text, with the description's masses, inertias and motor limits; comments are kept."""
+    """Return a description's URDF text with its present masses, inertias and joint limits; XML comments are kept."""
     root = fromstring(robot.urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
     for element in root.findall("link"):
         _write_inertial(_child(element, "inertial"), robot.link(element.get("name", "")))
@@ -48,7 +48,7 @@ def _write_limit(limit: Element, joint: Joint) -> None:
 
 
 def loop_closures(robot: RobotDescription, pose: dict[str, float]) -> str:
-    """Return the joints that close the robot's loops as YAML text.
+    """Return a YAML text with the joints that close the robot's loops, and with its standing pose.
 
     pose: angle [rad] of each joint in the standing pose, by name.
     """

@@ -1,4 +1,4 @@
-"""Export of the robot as a USD stage: an articulation in the standing pose, its loops as joints outside of it."""
+"""Export of the robot as a USD stage: an articulation in the standing pose, and loop joints excluded from it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ class UsdStage:
             self.frames[joint.child] = (place + rotate(quat, joint.origin), turned)
 
     def write(self, paw_friction: float) -> None:
-        """Write links, joints and loops to the USD stage under the default prim /jumper; paw_friction: Coulomb [1]."""
+        """Write links, joints and loops to the USD stage under the default prim /jumper.
+
+        paw_friction: Coulomb friction coefficient of the paws [1].
+        """
         self.geom.SetStageUpAxis(self.stage, self.geom.Tokens.z)
         self.geom.SetStageMetersPerUnit(self.stage, 1.0)
         self.physics.SetStageKilogramsPerUnit(self.stage, 1.0)

@@ -21,7 +21,7 @@ MOTOR_QUANTITIES = (
 
 @dataclass
 class RobotValues:
-    """Masses, joint, motor and spring constants of N robots, (N, columns) each.
+    """Masses, joint, motor and spring constants of N robots, each an array with one row per robot.
 
     Motors: legs FL, FR, BL, BR, each lateral, outer, inner.
     """
@@ -47,7 +47,7 @@ class RobotValues:
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of `count` equal robots as described (default: the Jumper); factors are 1, offsets 0."""
+        """Return the values of `count` robots equal to a description (default: the Jumper's): factors 1, offsets 0."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
         single = cls(

@@ -255,7 +255,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Allocate the arrays in which a reverse pass records the time steps that it recomputes, all zero."""
+        """Allocate zeroed arrays in which backpropagation records up to `steps` time steps that it recomputes."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -322,7 +322,7 @@ class JumperDynamics:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
     def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
-        """Return step size, number of steps and contact tolerance as the struct that the step kernels read.
+        """Return step size, step count and limits of the contact iteration as the struct that the step kernels read.
 
         dt [s]; max_sweeps and tolerance [m/s] end the contact iteration.
         """
@@ -350,7 +350,7 @@ class JumperDynamics:
         return drive
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that advances the physics, and its number of threads per block. by_legs: see `advance`."""
+        """Return the kernel that `advance` launches, and its number of threads per block; by_legs: see `advance`."""
         return advance_kernel(self.device, self.modules, by_legs)
 
     def advance(
@@ -404,7 +404,7 @@ class JumperDynamics:
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: WorldRange | None = None
     ) -> None:
-        """Compute passive and loop joints and the poses and velocities of all links from base and motor coordinates.
+        """Compute knee and ankle joints, and poses and velocities of all links, from base and motor coordinates.
 
         All joint coordinates are in q, qd: those of base and motors are read, the others written. body_q: poses [m],
         xyzw; body_qd: velocities [m/s], [rad/s]. worlds: range, by default all.

@@ -79,14 +79,17 @@ class Physics(ABC):
 
     @abstractmethod
     def forget(self, mask: wp.array) -> None:
-        """Clear warm starts, contact history and divergence flags of worlds in a mask, (num_worlds + 1,) bool."""
+        """Clear warm starts, contact history and divergence flags of the worlds in a mask.
+
+        mask: (num_worlds + 1,) bool; the last entry belongs to no world.
+        """
 
     @abstractmethod
     def after_reset(self, mask: wp.array) -> None:
         """Update the solver after joint coordinates were written in worlds whose mask (num_worlds,) is not 0."""
 
     def write_bodies(self) -> None:
-        """Compute the state's passive joints and bodies from its base and motor coordinates."""
+        """Compute the state's passive joints, body poses and body velocities from base and motor coordinates."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
@@ -98,9 +101,9 @@ class Physics(ABC):
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return by name the arrays that the next step depends on beside joint_q, joint_qd and `impulse`; not copies.
+        """Return by name the arrays, besides joint_q, joint_qd, `impulse`, that the next step depends on; no copies.
 
-        The next step depends on them, for example on a warm start of the solver. A solver without memory has none.
+        An example is a warm start of the solver. A solver without memory has none.
         """
         return {}
 
@@ -236,19 +239,19 @@ class MujocoPhysics(Physics):
         self.solver.notify_model_changed(RANDOMIZED_FLAGS)
 
     def after_reset(self, mask: wp.array) -> None:
-        """Clear the reset worlds' warm starts and write all bodies; see `Physics.after_reset`."""
+        """Clear reset worlds' warm starts, compute poses and velocities of all bodies; see `Physics.after_reset`."""
         self._launch(mask_kernel, self._sim.num_worlds, [mask], [self._mask])
         self.forget(self._mask)
         self.write_bodies()
 
     def forget(self, mask: wp.array) -> None:
-        """Clear the masked worlds' contact history and last velocities, which the loops' constraint rows read."""
+        """Clear masked worlds' contact history, and stored velocities that MuJoCo's constraints of the loops read."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         for stale in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
             self._launch(zero_worlds_kernel, stale.shape, [mask], [stale])
 
     def carried(self) -> dict[str, wp.array]:
-        """Return MuJoCo's warm start and velocities, and the bodies' poses and velocities; see `Physics.carried`."""
+        """Return MuJoCo's warm start, `cvel`, `cdof_dot`, and body poses and velocities; see `Physics.carried`."""
         data = self.solver.mjw_data
         names = ("qacc_warmstart", "cvel", "cdof_dot")
         bodies = {"body_q": self._sim.state.body_q, "body_qd": self._sim.state.body_qd}

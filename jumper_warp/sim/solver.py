@@ -51,7 +51,7 @@ def check_step(dt: float, substeps: int = 1) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raise InputError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
+    """Raise InputError unless the velocity tolerance [m/s] that ends the contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
         raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
 
@@ -68,7 +68,7 @@ def state_arrays(state: State | Model) -> Any:
 
 
 def warn_of_colliders(model: Model) -> None:
-    """Emit one UserWarning if shapes collide in the model that SolverJumper ignores."""
+    """Emit one UserWarning if the model has colliding shapes that SolverJumper ignores."""
     ignored = other_colliders(model)
     if len(ignored) > 0:
         warnings.warn(
@@ -327,7 +327,7 @@ class SolverJumper(SolverBase):
 
     @locked
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
-        """Reset the sliding blocks of some worlds, by default all, to their starts, at rest.
+        """Reset the sliding blocks of some worlds, by default all, to their start positions, at rest.
 
         `worlds`: indices, or a mask on the device, bool of shape (num_worlds,) or longer. Raises InputError without
         blocks, or for a shorter mask.
