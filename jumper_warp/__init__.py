@@ -1,4 +1,4 @@
-"""Simulation and reinforcement learning for the quadruped Jumper; `__all__` is imported lazily."""
+"""Simulation and reinforcement learning for the quadruped Jumper; the names in `__all__` are imported on first use."""
 
 from __future__ import annotations
 

@@ -15,8 +15,9 @@ ADAPTER = ("all_groups", "tensors", "autoreset_mode", "render_mode", "render_siz
 
 
 def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVectorEnv:
-    """Return a Gymnasium vector environment of a task; arguments: of `GymVectorEnv` (those in `ADAPTER`) and `Env`.
+    """Return a Gymnasium vector environment of a task with `num_envs` robots.
 
+    arguments: keyword arguments of `Env`, and those of `GymVectorEnv` that are in `ADAPTER`.
     Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
     adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
@@ -24,7 +25,7 @@ def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVector
 
 
 def make_env(task: str, **arguments: Any) -> GymEnv:
-    """Return a Gymnasium environment of a task with one robot; arguments: of `GymEnv` and of `Env`.
+    """Return a Gymnasium environment of a task with one robot; arguments: keyword arguments of `GymEnv` and `Env`.
 
     Raises InputError: an unknown task, or arguments that `Env` or `GymEnv` refuses.
     """

@@ -1,4 +1,4 @@
-"""The single import for user-defined rewards, observations and tasks.
+"""Names for defining rewards, observations and tasks, gathered in one module to import.
 
     from dataclasses import replace
     import warp as wp

@@ -54,7 +54,7 @@ class CompletionCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print the completion script of a shell; modules: the user's, whose tasks are registered already."""
+    """Print the completion script of a shell; modules: loaded by --task-module, with their tasks registered."""
     cfg = parse(CompletionCfg, "completion", args)
     from jumper_warp.registry import task_names
     from jumper_warp.utils.assets import policy_tasks
@@ -74,7 +74,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def settings_of(command: str) -> list[Any]:
-    """Return the dataclasses, or instances of them, whose fields are the flags of a command, for tasks of any kind."""
+    """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
     from jumper_warp.cli import doctor, export, info, list, sysid, train
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import EVALUATIONS
@@ -100,7 +100,7 @@ def options(flags: Iterable[Flag]) -> list[str]:
 
 
 def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
-    """Return the allowed values of each flag that takes one of several words, by the flag `--name`."""
+    """Return the allowed values of each flag with a fixed set of values, by flag such as `--solver`."""
     return {
         f"--{flag.name}": [str(value) for value in get_args(flag.kind) if value]
         for flag in flags

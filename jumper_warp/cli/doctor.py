@@ -41,7 +41,7 @@ class DoctorCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print the state of the installation; exits with code 1 if a device fails. modules: the user's, unused."""
+    """Print the state of the installation; exits with code 1 if a device fails. modules: unused."""
     cfg = parse(DoctorCfg, "doctor", args)
     import warp as wp
 
@@ -77,7 +77,7 @@ def version_of(package: str) -> str | None:
 
 
 def threads() -> dict[str, int]:
-    """Return the number of CPU cores, and of the default threads of simulations and of torch."""
+    """Return the number of CPU cores, and the default numbers of threads of simulations and of torch."""
     import torch
 
     from jumper_warp.utils.threads import available_threads
@@ -116,7 +116,7 @@ def file_sizes(folder: Path) -> Iterator[int]:
 
 
 def opengl() -> dict[str, str | None]:
-    """Return the name of the OpenGL implementation that draws pictures, and the reason if there is none."""
+    """Return the `name` of the OpenGL implementation that renders images, or the `error` if there is none."""
     from jumper_warp.viz.renderer import opengl_name
 
     try:
@@ -126,7 +126,7 @@ def opengl() -> dict[str, str | None]:
 
 
 def check_device(device: Any) -> dict[str, Any]:
-    """Step an environment on a Warp device; return the device's properties, times and rate, or the error."""
+    """Return a Warp device's properties, and the build time and step rate of an environment on it, or the error."""
     result: dict[str, Any] = {"alias": str(device), "name": None, "error": None}
     worlds = WORLDS["cuda" if device.is_cuda else "cpu"]
     try:

@@ -39,9 +39,10 @@ SUITE = "--suite"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper evaluate` with the given arguments; modules: the user's, for tasks outside the project.
+    """Run `jumper evaluate` with the given arguments; args: the policy, then flags.
 
-    args: the policy, then flags. Raises InputError or OSError: the policy or a flag is invalid. Exits as tyro does.
+    modules: loaded by --task-module, for tasks outside the project. Raises InputError or OSError: the policy or a flag
+    is invalid. Exits with 0 after help.
     """
     policy = policy_of("evaluate", ABOUT, args)
     args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
@@ -87,7 +88,7 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
 
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
-    """Load a policy or a training run for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
+    """Load a policy or a training run for evaluation. Raises PolicyError or CheckpointError if it cannot be used."""
     from jumper_warp.utils.progress import phase
 
     with phase(f"opening {policy}"):

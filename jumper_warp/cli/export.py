@@ -38,10 +38,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def export(cfg: ExportCfg) -> Path:
-    """Write the policy's folder or ONNX file, print its path and return it; print a run's checkpoint on standard error.
+    """Write a policy as a folder or an ONNX file, print its path and return it.
 
-    Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's suffix, or
-    exists and `overwrite` is not set. CheckpointError: the checkpoint cannot be used.
+    For a training run, also prints on standard error which checkpoint is exported. Raises PolicyError: the source
+    cannot be used, two policies cannot be blended, the folder has a file's suffix, or exists without `overwrite`.
+    CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.blend import blend
     from jumper_warp.policies.catalog import newest_run

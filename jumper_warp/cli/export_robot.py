@@ -12,7 +12,7 @@ from jumper_warp.cli.main import parse
 
 @dataclass(frozen=True)
 class ExportRobotCfg:
-    """Write the robot for another simulator: MJCF (MuJoCo), URDF with its loops as YAML, or USD (needs usd-core)."""
+    """Write the robot for another simulator: MJCF (MuJoCo), URDF with closed loops as YAML, or USD (needs usd-core)."""
 
     out: Path
     """Folder to write to; existing files are replaced."""

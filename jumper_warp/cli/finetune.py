@@ -18,8 +18,9 @@ network, and save the result as a new policy."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper finetune` with the given arguments; modules: the user's, for tasks outside the project.
+    """Run `jumper finetune` with the given arguments.
 
+    modules: loaded by --task-module, for tasks outside the project.
     Raises UsageError, InputError or OSError: the policy or a flag is invalid.
     """
     name = policy_of("finetune", ABOUT, args)

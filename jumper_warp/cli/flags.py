@@ -1,4 +1,4 @@
-"""The flags that tyro makes of a dataclass, as a list: for help, suggestions, renamed flags and shell completion."""
+"""List of the flags that tyro generates from a dataclass, for help, suggestions, renamed flags and completion."""
 
 from __future__ import annotations
 

@@ -47,7 +47,10 @@ def help_page(program: str, about: str, flags: Sequence[Flag], args: Sequence[st
 
 
 def group_of(name: str, flags: Sequence[Flag]) -> list[Flag]:
-    """Return the flags of a group, such as ppo or env.rewards, or the flag of this name. Raises InputError: none."""
+    """Return the flags of a group, such as ppo or env.rewards, or the flag of this name.
+
+    Raises InputError: there is neither.
+    """
     name = name.lstrip("-").replace("_", "-")
     chosen = [flag for flag in flags if f"{flag.name}.".startswith(f"{name}.")]
     if chosen:

@@ -55,7 +55,7 @@ class InfoCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print the description of a task or a policy; modules: the user's, whose tasks are registered already.
+    """Print the description of a task or a policy; modules: loaded by --task-module, with their tasks registered.
 
     Raises InputError: there is no such task or policy, or it cannot be read.
     """
@@ -101,7 +101,7 @@ def _shown(path: Path) -> str:
 
 
 def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the lines of the table of a policy's results: a line for each condition, of the first seed.
+    """Return a table of a policy's results as lines of text: one for each test condition, with its first seed.
 
     Tests with other commands than the first row's are left out. rows: as in the policy's metrics.json.
     """
@@ -143,8 +143,9 @@ def properties(values: Mapping[str, str]) -> list[str]:
 
 
 def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, Any], list[str]]:
-    """Return the description of a task as JSON data and as lines of text; modules: as of `run`.
+    """Return the description of a task as JSON data and as lines of text.
 
+    modules: loaded by --task-module, for the printed `jumper train` command.
     Raises InputError: it is unknown, invalid, or cannot be saved.
     """
     from jumper_warp.cli.train import command_line
@@ -178,7 +179,7 @@ def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, 
 
 
 def contents_of(task: TaskCfg) -> dict[str, Any]:
-    """Return sizes, names of observations, weights of rewards and names of terminations of a task as JSON data."""
+    """Return a task's observation and action sizes, observations, reward weights and terminations as JSON data."""
     return {
         "observation_sizes": {
             group: max(end for _, end in task.layout(group).values()) for group in ("actor", "critic")

@@ -30,7 +30,7 @@ class ListCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print tasks and policies, one a line; modules: the user's, whose tasks are registered already."""
+    """Print tasks and policies, one a line; modules: loaded by --task-module, with their tasks registered."""
     cfg = parse(ListCfg, "list", args)
     from jumper_warp.policies.catalog import summarise
     from jumper_warp.utils.assets import POLICIES, policy_tasks
@@ -67,7 +67,7 @@ def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[dict[str, An
 
 
 def describe(policy: PolicySummary) -> dict[str, Any]:
-    """Return the description of a policy as JSON data; success and error: of the nominal robot, None: not evaluated."""
+    """Return a policy's name, task, success rate, error, size and folder as JSON data; None: not evaluated."""
     return {"name": policy.name, "task": policy.task, "success_rate": policy.success, "error": policy.error,
             "size_bytes": policy.size_bytes, "folder": str(policy.folder)}  # fmt: skip
 

@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def dispatch(args: Sequence[str]) -> None:
-    """Run the command named by the first argument; errors in the user's files become InputError.
+    """Run the command named by the first argument; errors in files of --task-module become InputError.
 
     Raises UsageError: there is no such command. Other exceptions are the command's.
     """

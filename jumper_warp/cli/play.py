@@ -23,10 +23,10 @@ SCRIPT, DUMP = "--script", "--dump"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper play` with the given arguments; modules: the user's, for tasks outside the project.
+    """Run `jumper play` with the given arguments; args: the policy, then flags, or flags with --script or --dump.
 
-    args: the policy, then flags, or flags with --script or --dump. Raises InputError or OSError: the policy, a file or
-    a flag is invalid. Exits as tyro does.
+    modules: loaded by --task-module, for tasks outside the project. Raises InputError or OSError: the policy, a file or
+    a flag is invalid. Exits with 0 after help.
     """
     names = {arg.partition("=")[0] for arg in args} if args and args[0].startswith("-") else set()
     if DUMP in names:

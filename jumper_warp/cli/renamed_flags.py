@@ -1,4 +1,4 @@
-"""Flags that were renamed: for one release the old ones work and print the new ones (CHANGELOG.md)."""
+"""Renamed flags: for one release the old names still work, and a message gives the new ones (CHANGELOG.md)."""
 
 from __future__ import annotations
 

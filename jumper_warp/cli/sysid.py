@@ -1,4 +1,4 @@
-"""`jumper sysid`: identify the robot's parameters from recorded motions, plan such motions, fit one motor."""
+"""`jumper sysid`: identify the robot's parameters from recorded motions, plan such motions, or identify one motor."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class ActuatorCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper sysid` with the given arguments: identify parameters, plan motions (excite), or fit one motor.
+    """Run `jumper sysid` with the given arguments: identify the robot, plan motions, or identify one motor.
 
     modules: unused, as all commands take it. Raises InputError or OSError: data or a flag is invalid.
     """

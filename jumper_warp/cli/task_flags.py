@@ -1,4 +1,4 @@
-"""Command-line flags for the settings of any task; its functions have no flags.
+"""Command-line flags for the settings of any task that are numbers or choices.
 
     --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
@@ -26,7 +26,7 @@ NO_SOURCE = __package__
 
 
 class Setting(NamedTuple):
-    """Setting of a task, or a group of settings, as a field of a dataclass that tyro turns into flags."""
+    """Type, default and help text of a flag, or of a group of flags, for a task's settings."""
 
     kind: Any  # type of the setting, for tyro
     value: Any  # default; of a group, an instance of its dataclass

@@ -72,7 +72,7 @@ class TrainArgs:
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
-    """Return the settings of `jumper train`, and the task changed by --env flags; exits after help and as tyro does.
+    """Return the settings of `jumper train`, and the task changed by --env flags; exits with 0 after help.
 
     args: the task, then flags. With --resume the saved settings of the run are the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
@@ -112,7 +112,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
-    """Return and print the flags that a task's preset, chosen by --preset in unparsed arguments, stands for.
+    """Return and print the flags of the task's preset that --preset selects in unparsed arguments.
 
     Flags that the arguments override, or that the --trainer does not use, are left out.
     Raises UsageError: the task has no such preset.
@@ -145,9 +145,9 @@ def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings parsed from `args`, and the task changed by its --env flags; exits as tyro does.
+    """Return the settings parsed from `args`, and the task changed by its --env flags.
 
-    Raises InputError: a setting is out of range.
+    Exits with 0 after help. Raises InputError: a setting is out of range.
     """
     from jumper_warp.cli.task_flags import flags_of, with_flags
 
@@ -237,7 +237,7 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
 
 def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
-    """Print the expected duration of a training on a CPU, unless it is short; presets: names of the task's."""
+    """Print the expected duration of a training on a CPU, unless it is short; presets: names of the task's presets."""
     from jumper_warp.rl.logger import format_duration
 
     cfg, done = args.cfg, args.checkpoint.state["iteration"] if args.checkpoint else 0

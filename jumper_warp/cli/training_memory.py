@@ -68,7 +68,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
-    """Return the size of PPO's rollout buffers for each world [byte], without log_std."""
+    """Return the size of PPO's rollout buffers for each world [byte]."""
     per_step = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # reward, done, timeout
     return FLOAT_BYTES * (num_steps * per_step + num_obs + num_critic_obs)  # observations after the last step
 
@@ -131,7 +131,7 @@ def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, 
 
 
 def describe_need(pools: Sequence[MemoryPool], ppo: PpoCfg, num_envs: int) -> str:
-    """Return one line with need and size of the tightest memory [GB], and the largest number of worlds that fits.
+    """Return one line on the memory that limits the number of worlds: need and free size [GB], and worlds that fit.
 
     If `num_envs`, of this process, should fit, half of it is suggested.
     """

@@ -1,4 +1,4 @@
-"""Gradients w.r.t. masses, centres of mass and inertias of bodies, from the gradient w.r.t. the parameter table."""
+"""Gradients w.r.t. bodies' masses, centres of mass and inertias, from those w.r.t. the kernels' parameter table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def moment_rows(body: int) -> slice:
-    """Return the rows of the parameter table that hold a body's mass and first and second moments of mass.
+    """Return the rows of the kernels' parameter table with a body's mass and first and second moments of mass.
 
     A slice of ten rows: mass, 3 first and 6 second moments, see `PAIRS`. body: 0 is the base; then 5 links of each leg
     FL, FR, BL, BR, as in the model.
@@ -22,7 +22,7 @@ def moment_rows(body: int) -> slice:
 
 
 def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
-    """Convert a gradient w.r.t. the parameter table to gradients w.r.t. mass, centre of mass and inertia of each body.
+    """Convert a gradient w.r.t. the kernels' parameter table to gradients w.r.t. bodies' mass, com and inertia.
 
     They are w.r.t. mass [kg], com [m] and inertia about the com [kg m^2], in link axes. table, gradient: parameter
     table and gradient w.r.t. it, (321, num_worlds). The table holds first moments m c and second moments S = 1/2 tr(I)

@@ -82,7 +82,7 @@ def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tenso
 
 
 class ClosedLoop:
-    """Differentiable policy steps and observations of an environment's robots under a policy.
+    """Differentiable closed loop of an environment's robots and a policy: policy steps and observations.
 
     `advance` and `observe` are functions of tensors, in single or double precision; `step` also steps the
     environment and returns its values with derivatives.
@@ -199,7 +199,7 @@ class ClosedLoop:
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
-        """Convert the state of the closed loop to the robots' pose, velocity and motor angles, worlds first."""
+        """Convert the state of the closed loop to the robots' pose, velocity and motor angles, (num_worlds, ...)."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]
@@ -211,7 +211,7 @@ class ClosedLoop:
         """Return the observation of the actor or critic as a differentiable function of the state, without noise.
 
         group: "actor" or "critic". Returned: (num_worlds, columns). observed: the environment's observation of the
-        group, for columns without derivatives, such as commands.
+        group, from which columns without derivatives, such as commands, are copied.
         """
         motion, columns, histories = self.motion(state), [], iter(self._histories(state))
         for term, first, end in self._columns[group]:

@@ -1,4 +1,4 @@
-"""Environment whose observations and rewards have derivatives w.r.t. the actions of a window of policy steps."""
+"""Environment whose observations and rewards have derivatives w.r.t. actions, over windows of policy steps."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class DifferentiableEnv:
         return getattr(self.env, name)
 
     def begin_window(self) -> None:
-        """Start a window of policy steps; the current state becomes a constant, at which backpropagation ends."""
+        """Start a window of policy steps: detach the current state, so that no derivatives reach earlier steps."""
         self._state = self.loop.state()
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -65,7 +65,7 @@ class DifferentiableEnv:
         return with_gradient_of(obs, self.loop.observe(state, obs)), with_gradient_of(critic_obs, critic)
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Step the environment, and return the reward (num_envs,) with derivatives of its terms in `SMOOTH`.
+        """Step the environment, and return the reward (num_envs,) with derivatives of the reward terms in `SMOOTH`.
 
         action: (num_envs, 12), clamped to ±1. The last reward of an episode has no derivative. Call `begin_window`
         first, and no `step` within a window.

@@ -1,4 +1,4 @@
-"""Batched rollouts with gradients: forward and reverse passes through filter, latency, motors and physics.
+"""Batched rollouts with gradients: forward and reverse passes through command filter, latency, motors and physics.
 
 A forward pass is one launch for all worlds (on a CPU one launch for each thread), as is a reverse pass; on a GPU the
 reverse pass is four launches for every few rows (`reverse_legs`). Between the passes only a row of the state every few

@@ -20,9 +20,9 @@ LANDING, RECOVERED = 18, 30  # policy steps after touchdown that count as landin
 
 
 class RewardContext(NamedTuple):
-    """States and flags from which the rewards of a policy step are computed, for n worlds.
+    """States of robot and jump from which the rewards of a policy step are computed, for n worlds.
 
-    Phases and flags are those at the end of the step.
+    The phase and conditions such as `landing` are those at the end of the step.
     """
 
     motion: RobotState  # at the end of the step
@@ -44,7 +44,7 @@ class RewardContext(NamedTuple):
 def make_context(
     loop: ClosedLoop, state: LoopState, prev_state: LoopState, arrays: Mapping[str, np.ndarray]
 ) -> RewardContext:
-    """Collect the states and flags from which the rewards of a policy step are computed.
+    """Collect the states of robot and jump from which the rewards of a policy step are computed.
 
     The step leads from prev_state to state; arrays: `Env.task_arrays` before resets.
     """
@@ -96,23 +96,24 @@ def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Te
 
 
 def waiting_scale(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the factor (n,) on a reward: the constant `waiting_scale` while a commanded jump has not begun, else 1."""
+    """Return the factor (n,) of a reward: the constant `waiting_scale` from a jump's command to its start, else 1."""
     return torch.where(ctx.jump_due, const["waiting_scale"], 1.0)
 
 
 def posture(ctx: RewardContext, const: Mapping[str, float], shift: float) -> torch.Tensor:
-    """Return how close the motor angles are to the default pose, a number [1] that is 1 at the pose.
+    """Return a measure (n,), at most 1, of how close the motor angles are to the default pose plus `shift`.
 
-    Shape (n,); shift [rad]: added to transversal motors. Constants: std [rad].
+    shift [rad]: added to the pose's transversal angles. Constants: std [rad].
     """
     shifts = ctx.default.new_tensor(4 * [0.0, shift, shift])
     return gaussian((ctx.motion.angle - ctx.default - shifts).square().mean(1), const["std"])
 
 
 def symmetry(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return how symmetric the legs are [1]: largest for equal transversal angles and lateral angles of 0.
+    """Return a measure (n,) of how symmetric the legs are: largest for equal transversal angles and lateral angles 0.
 
-    Shape (n,), the product of both closenesses. Constants: std_variance [rad^2], std_lateral [rad], waiting_scale [1].
+    The product of a Gaussian for each of the two and of `waiting_scale`. Constants: std_variance [rad^2], std_lateral
+    [rad], waiting_scale [1].
     """
     legs = ctx.motion.angle.view(-1, 4, 3)
     spread = legs[:, :, 1:].flatten(1).var(1, correction=0)

@@ -37,7 +37,7 @@ class Snapshot(NamedTuple):
 
 
 def compact_columns(joint_values: torch.Tensor, base: int) -> torch.Tensor:
-    """Select the values of base and motors from Newton's joint coordinates or rates.
+    """Return the values of the base and the 12 motors from Newton's joint coordinates or rates.
 
     joint_values: (num_worlds, columns). Returned: (base + 12, num_worlds). base: number of base columns, 7 coordinates
     or 6 rates; 20 columns of leg joints follow.

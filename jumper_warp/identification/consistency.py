@@ -38,7 +38,7 @@ class FitTest:
 
 
 def chi2_limit(count: int, fitted: float, correlation: float, level: float) -> float:
-    """Return the mean square of residuals (χ²) that a right model exceeds with probability `level`.
+    """Return the limit that the mean square of residuals (χ²) of a correct model exceeds with probability `level`.
 
     χ² is the mean square of `count` normal residuals of variance 1, of which the fit determines `fitted` (trace of the
     hat matrix). Correlated residuals act like count / correlation independent ones.
@@ -59,7 +59,7 @@ def variance_factor(columns: Sequence[np.ndarray]) -> float:
 
 
 class Sensor(NamedTuple):
-    """Sensor in one motion: a motor's angle and rate or a channel of the base, with Fisher information and score."""
+    """Sensor of one motor or one channel of the base in one motion, with Fisher information and score of its data."""
 
     motion: MotionResiduals
     name: str  # such as "BL_outer" or "position"

@@ -70,7 +70,7 @@ class Scorer:
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
-        """Simulate the described robot under the motor targets of a plan, and return its motion.
+        """Simulate the nominal robot under the motor targets of a plan, and return its motion.
 
         One world, from rest in the pose of the first targets.
         """
@@ -101,7 +101,7 @@ class Excitation:
     parameters: ParameterSet
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `excite.json`: information gain, refused motions and parameters, but no robot mass."""
+        """Return the content of `excite.json` but the robot's mass: information gain, refused motions, parameters."""
         expected = {
             p.name: {"unit": p.unit, "expected_deviation": p.std(0.0, float(d)), "of_prior": float(d)}
             for p, d in zip(self.parameters, self.std, strict=True)

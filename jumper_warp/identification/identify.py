@@ -72,7 +72,7 @@ def identify(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Identify the robot's parameters from recorded motions by Levenberg-Marquardt in stages.
+    """Identify the robot's parameters from recorded motions by least squares (Levenberg-Marquardt).
 
     prior_measurements: such as a weighed mass. dt [s]: largest physics step, by default 1/480. replay: simulation to
     reuse from an earlier call; it overrides description, device and threads (of the CPU). Raises InputError: no
@@ -145,7 +145,7 @@ def identify_by_evolution(
 
 
 class Descent:
-    """Levenberg-Marquardt optimisation of a robot's parameters in stages, with a log of its steps and effort."""
+    """Levenberg-Marquardt optimisation of a robot's parameters, with a log of steps and of computing time."""
 
     def __init__(self, replay: MotionReplay, advance: Callable[[], object] = lambda: None):
         """Start the clocks and an empty log of the optimisation at stage 0.
@@ -168,7 +168,7 @@ class Descent:
     def minimise(
         self, problem: LeastSquares, point: Point, normal: NormalEquations, decrease: float | None = None
     ) -> tuple[Point, NormalEquations]:
-        """Minimise a least-squares problem by one stage of Levenberg-Marquardt steps.
+        """Minimise a least-squares problem by Levenberg-Marquardt steps, which form one stage of the log.
 
         Returned: the point after the stage, and the normal equations there. decrease: the stage ends at the first step
         that lowers the cost by less than this fraction; None: at the first step with a new Jacobian that lowers it by
@@ -191,7 +191,7 @@ class Descent:
         return point, normal
 
     def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> Minimum:
-        """Find the local minimum near a point, and again from another friction of the paws if that lowers the cost.
+        """Find the local minimum near a point; if another paw friction lowers the cost, find the minimum from there.
 
         normal: the normal equations at the point.
         """
@@ -213,7 +213,7 @@ def descend(
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
 ) -> tuple[LeastSquares, list[Minimum]]:
-    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starts.
+    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starting points.
 
     Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
     best exclude jumps of the residuals. The first start begins at the described robot and adds the motions one after
@@ -267,7 +267,10 @@ def descend(
 
 
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
-    """Return a random change (P,) of the parameters, to start a search away from a minimum with equations `normal`."""
+    """Return a random change (P,) of the parameters, from a minimum to a new starting point.
+
+    normal: normal equations at the minimum.
+    """
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
     move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
     return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)

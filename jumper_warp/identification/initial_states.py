@@ -1,4 +1,4 @@
-"""Initial states of motions: a prior from the first measured rows, and the stance of a robot with resting paws."""
+"""Initial states of recorded motions: their prior distribution, and the pose of a robot that stands on four paws."""
 
 from __future__ import annotations
 

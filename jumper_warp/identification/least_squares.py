@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for recorded motions; parallel worlds try all damping values of a step at once."""
+"""Least-squares fit to recorded motions by Levenberg-Marquardt; parallel worlds try all dampings of a step at once."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class NormalEquations:
     weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 
     def of_rows(self, index: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Fisher information (P, P) and score (P,) that a part of a motion's residuals has, (m,) bool `rows`.
+        """Return Fisher information (P, P) and score (P,) of the residuals of a motion that `rows`, (m,) bool, selects.
 
         About the normalised parameters, while the motion's initial state follows them. The score is the gradient of
         half the residuals' cost. index: of the motion.
@@ -74,7 +74,7 @@ class NormalEquations:
         return 0.5 * (information + information.T), score
 
     def following(self, starts: Sequence[np.ndarray], moves: np.ndarray) -> list[np.ndarray]:
-        """Return the initial states (K, I), by motion, that fit best after changes of the parameters (K, P).
+        """Return for each motion the initial states (K, I) that fit best after K changes of the parameters, (K, P).
 
         starts: (I,) by motion, before the moves.
         """
@@ -162,7 +162,7 @@ class LeastSquares:
         self._change = [np.full(len(parameters) + motion.start_size, DIFFERENCE) for motion in motions]
 
     def scale(self, normal: NormalEquations) -> float:
-        """Return the unit in which costs are compared: the mean squared residual of a fit, at least 1."""
+        """Return the unit [1] of cost differences: the mean squared residual of the data at `normal`, at least 1."""
         return max(1.0, normal.data_cost / self.count)
 
     def nominal_point(self) -> Point:
@@ -283,7 +283,7 @@ class LeastSquares:
         return limit**2 * np.log1p((residual / limit) ** 2)
 
     def prior_residuals(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
-        """Return (residual over its std, gradient (P,)) of each prior measurement, as a weighed mass, at z (P,)."""
+        """Return residual over std and gradient (P,) of each prior measurement, such as a weighed mass, at z (P,)."""
         step = 1.0e-6
         robots = self.parameters.robots(np.concatenate([z[None], z + step * np.eye(len(z))]), self.replay.description)
         residuals = []

@@ -172,7 +172,7 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
 def ratio(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return an unknown positive parameter: the logarithm of its ratio to the nominal value has a normal prior.
+    """Return a positive parameter whose ratio to the nominal value has a log-normal prior.
 
     prior: std [1] of ln(value / nominal); bounds: 5 std, at most tenfold.
     """
@@ -183,7 +183,7 @@ def ratio(
 def relative(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return an unknown positive parameter: its ratio to the nominal value has a normal prior.
+    """Return a positive parameter whose ratio to the nominal value has a normal prior.
 
     prior: std [1] of value / nominal; bounds: 5 std, at least a tenth. Equations of motion are linear in masses, gains
     and armature: combinations that the motions do not determine lie along straight lines of z, which steps of the
@@ -194,7 +194,7 @@ def relative(
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the motor parameters: kp, kd and armature of 12 motors; torque limit and speeds by kind of motor."""
+    """Return the parameters of motors: kp, kd, armature of each; torque limit, cutoff, no-load speed of each kind."""
     parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         parameters += [

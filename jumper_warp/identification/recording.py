@@ -66,7 +66,10 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
 
 
 def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
-    """Sample motor targets [deg] (ticks, 12) of a chirp with a random phase by motor; smaller, slower unless `hung`."""
+    """Sample motor targets [deg] (ticks, 12) of a chirp with a random phase of each motor.
+
+    hung: whether the robot hangs on a stand; otherwise the motion is smaller and slower.
+    """
     time = TICK * np.arange(ticks)
     slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
     cycles = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
@@ -110,7 +113,7 @@ def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Init
 
 
 def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
-    """Simulate one robot that follows planned motor targets from rest, and return its motion, sampled at 240 Hz.
+    """Simulate one robot under planned motor targets from rest by `replay`, and return its motion at 240 Hz.
 
     refine: physics steps per 1/480 s."""
     period, stride = TICK / SAMPLES, 2 * refine
@@ -127,7 +130,7 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
 def simulate_plan(
     plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
-    """Simulate one robot under planned motor targets from rest by `Simulation`, rows at 240 Hz.
+    """Simulate one robot under planned motor targets from rest with any solver, and return its motion at 240 Hz.
 
     robots: N = 1, by default as described. dt [s]: physics step. Raises InputError: dt does not divide 1/240 s.
     """
@@ -203,7 +206,7 @@ def measure(
     torque: bool = False,
     base_every: int = 2,
 ) -> RecordedMotion:
-    """Turn a simulated motion into a recording as sensors would give it, with their offsets and noise.
+    """Convert a simulated motion to the recording that sensors with offsets and noise would make of it.
 
     Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion of world 0;
     robots: its sensor offsets. rng: random numbers of the noise, None for no noise. noise: its standard deviations.

@@ -104,11 +104,10 @@ class MotionReplay:
 
 
 def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: int) -> np.ndarray:
-    """Delay sent motor targets by the latency of each robot.
+    """Return the motor targets that act in each physics step, delayed by the latency of each robot, (steps, 12, N).
 
-    Returned: the targets that act in each physics step, (steps, 12, N), from the sent targets (S, 12). latency: (N,)
-    [physics steps], may be fractional: a step uses the mean target over its duration, which is continuous in the
-    latency. lead: rows of `target` before the first step.
+    target: sent targets (S, 12). latency: (N,) [physics steps], may be fractional: a step uses the mean target over its
+    duration, which is continuous in the latency. lead: rows of `target` before the first step.
     """
     delay, world = np.unique(latency, return_inverse=True)
     whole = np.floor(delay).astype(int)

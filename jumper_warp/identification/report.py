@@ -96,7 +96,10 @@ def write_results(result: Identification, folder: Path, source: str) -> None:
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
-    """Return the identified robot as a robot overlay, its 95 % intervals as randomisation ranges; source: text."""
+    """Return the identified robot as a robot overlay, with 95 % intervals as randomisation ranges.
+
+    source: text on the origin of the values, for the overlay.
+    """
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
 
@@ -171,7 +174,7 @@ def summary(result: Identification) -> str:
 
 
 def starts_line(result: Identification) -> str:
-    """Return one line of text on whether the starts of the optimisation found the same result."""
+    """Return one line of text on whether the best two starting points of the optimisation reached the same cost."""
     if result.starts_agree is None:
         return "one start"
     others = ", ".join(
@@ -260,7 +263,7 @@ def parameter_plot(result: Identification) -> Any:
 
 
 def progress_plot(result: Identification) -> Any:
-    """Return a plot (Matplotlib figure) of χ² over the physics steps of the optimisation, a line for each stage."""
+    """Return a plot (Matplotlib figure) of χ² over the physics steps, with a curve for each stage of the fit."""
     figure = new_figure(6.0, 2.6)
     axis = figure.subplots()
     for stage in sorted({step.stage for step in result.steps}):

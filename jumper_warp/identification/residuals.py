@@ -127,7 +127,7 @@ class MotionResiduals:
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def first_part(self, fraction: float) -> MotionResiduals:
-        """Return the residuals of the first `fraction` (0 to 1) of the motion's rows, with the same initial prior."""
+        """Return the residuals of the first `fraction` (0 to 1) of the rows; the initial state's prior is unchanged."""
         if fraction >= 1.0:
             return self
         part = copy.copy(self)

@@ -79,7 +79,7 @@ class Start:
 
 
 def excess_costs(problem: LeastSquares, minima: Sequence[Minimum]) -> np.ndarray:
-    """Return the excess cost (K,) of each minimum over the best, the first, divided by the best one's χ² if above 1."""
+    """Return each minimum's cost above that of the first, best one (K,), divided by the best one's χ² if above 1."""
     costs = np.array([minimum.normal.cost for minimum in minima])
     return (costs - costs[0]) / problem.scale(minima[0].normal) if minima else costs
 
@@ -123,7 +123,7 @@ class Identification:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations (P,) of normalised parameters from noise, model errors and starts, at most 1 (prior)."""
+        """Standard deviations (P,) of normalised parameters, at most 1 (prior): noise, model errors, other minima."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
         return np.minimum(np.sqrt(noise**2 + self.systematic**2 + self.spread**2), 1.0)
 
@@ -142,12 +142,12 @@ class Identification:
 
     @property
     def starts_agree(self) -> bool | None:
-        """Whether two starts ended in minima of the same cost; None if there was one start."""
+        """Whether the best two starting points led to minima of the same cost; None if there was only one."""
         return starts_agree([start.excess for start in self.starts]) if len(self.starts) > 1 else None
 
     @property
     def consistent(self) -> bool:
-        """Whether the fit passes all tests and its starts agree, if there were several."""
+        """Whether the fit passes all tests, and the best two starting points, if used, led to the same cost."""
         return self.starts_agree is not False and all(test.passed for test in self.tests)
 
     @property
@@ -220,7 +220,7 @@ def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
 
 
 def trapped_spread(problem: LeastSquares, minimum: Minimum, covariance: np.ndarray) -> np.ndarray:
-    """Return standard deviations (P,) of normalised parameters that a linear model misses, as a paw may also stick.
+    """Return additional standard deviations (P,) of normalised parameters, for paws that may also stick.
 
     covariance: of the linear model, (P, P).
     """

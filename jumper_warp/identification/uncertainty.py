@@ -1,4 +1,4 @@
-"""Uncertainty of an identification: mismatch of the model, and undetermined combinations of parameters."""
+"""Uncertainty of an identification: effects of model errors, and undetermined combinations of parameters."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
 
 
 def trapped_variance(moves: np.ndarray, excess: np.ndarray, std: float) -> float:
-    """Return the variance of a parameter around its fit that the linear model's standard deviation `std` misses.
+    """Return a parameter's additional variance from values that fit better than the linear model (std) predicts.
 
     While a paw slips, its friction is determined; yet a greater friction, at which it sticks, may fit as well. The
     parameter's density is that of the linear model, plus what other values' likelihoods exceed it. moves: changes of
@@ -95,7 +95,7 @@ def autocorrelation(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covariance: np.ndarray) -> np.ndarray:
-    """Return cluster-robust standard deviations of the parameters (P,), from contradicting channels and motions.
+    """Return the parameters' standard deviations (P,) from contradictions between channels and between motions.
 
     An error of the model repeats in each row, so the clusters are each channel of each motion (such as a motor's
     angle), and each motion. The changes by leaving one cluster out, to first order, give the jackknife's estimate

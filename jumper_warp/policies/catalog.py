@@ -59,7 +59,7 @@ class PolicySummary:
 
     @property
     def error(self) -> dict[str, Any] | None:
-        """Mean error of the policy at its task, with value and unit as in metrics.json; None: not evaluated."""
+        """Error in the first test condition, such as the mean apex error, as in metrics.json; None: not evaluated."""
         return next((self.metrics[key] for key in ERRORS if key in self.metrics), None)
 
 

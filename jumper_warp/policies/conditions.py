@@ -81,7 +81,7 @@ class Conditions:
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
-        """Return the robot overlay (values that differ from the description): of the file `robot`, else of the policy.
+        """Return the robot overlay (values that differ from the description): from the file `robot`, else the policy's.
 
         None: the described robot. config: `Policy.config`. Raises InputError or OSError: the overlay cannot be used.
         """
@@ -107,7 +107,7 @@ class Conditions:
         return ranges.with_fixed(**self.fixed_parameters)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a copy of a task with gravity, randomisation and events of these conditions, and no collision margins.
+        """Return a copy of a task with these conditions' gravity, randomisation and events, and collision margins 0 m.
 
         With fixed parameters and no randomisation it is on level ground, without the task's events.
         """
@@ -124,7 +124,7 @@ class Conditions:
 
 
 def shared_config(configs: Mapping[str, dict[str, Any]], conditions: Conditions) -> dict[str, Any]:
-    """Return the configuration whose robot overlay (changed robot values) several policies on one robot use; {}: none.
+    """Return the configuration whose robot overlay (changed robot values) applies to several policies; {} if none.
 
     configs: `Policy.config` by name of the policy. One line on standard error names policies of the described robot
     that get the overlay of another one. The overlay of `conditions` replaces all of these.

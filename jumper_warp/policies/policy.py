@@ -21,7 +21,7 @@ class _Linear(nn.Linear):
     """Linear layer without initial weights: `nn.utils.skip_init` avoids them too, but imports SymPy."""
 
     def reset_parameters(self) -> None:
-        """Leave the weights and the random streams unchanged."""
+        """Skip the initialisation of weights, and leave the random streams unchanged."""
 
 
 class Policy(nn.Module):

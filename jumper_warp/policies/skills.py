@@ -1,4 +1,4 @@
-"""Policies for walking and jumps on one robot, as skills of one environment."""
+"""Policies for walking and jumps, between which the robots of one environment can switch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SkillNames:
 
 
 class SkillPolicies:
-    """Policies for walking, vertical and horizontal jumps (WALK, JUMP_UP, JUMP_TO); `env` makes their environment.
+    """Policies for walking, vertical and horizontal jumps (WALK, JUMP_UP, JUMP_TO), with their environment (`env`).
 
     sources, policies, tasks: name, policy and task of each; skills, handovers: tasks in the conditions of the last
     `env`, and the conditions for a change of the skill.

@@ -13,7 +13,7 @@ from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file
 
 
 def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[str, np.ndarray]:
-    """Return the arrays of an npz file by name, without pickled ones.
+    """Return the arrays of an npz file by name; pickled objects are refused.
 
     purpose: content of the file, for messages. error: class of the error. Raises `error`: it is no regular file, larger
     than MAX_BYTES, also unpacked, damaged, or holds something else; the message has the path.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def assets_folder(package: Path) -> Path:
-    """Return the folder of descriptions and policies of a package: inside it (wheel), else next to it (clone)."""
+    """Return the folder of robot description and policies: inside the package (wheel), else next to it (clone)."""
     inside = package / "assets"
     return inside if inside.is_dir() else package.parent / "assets"
 
@@ -20,6 +20,6 @@ def dashed(name: str) -> str:
 
 
 def policy_tasks() -> dict[str, str]:
-    """Return the name of the task of each of the project's policies, by the policy's name."""
+    """Return the task name of each of the project's policies, by policy name."""
     files = sorted(POLICIES.glob("*/config.json"))
     return {file.parent.name: json.loads(file.read_bytes())["interface"]["task"] for file in files}

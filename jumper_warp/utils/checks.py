@@ -147,7 +147,7 @@ def check_seed(value: Any) -> None:
 
 
 def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:
-    """Raise InputError unless limits of an angle [deg] are finite, lower < upper, without overlapping zones.
+    """Raise InputError unless limits of an angle [deg] are finite and in order, and zones inside do not overlap.
 
     lower_zone, upper_zone: widths of the zones inside the limits [deg], >= 0.
     """
@@ -170,6 +170,6 @@ def check_filter_speed(horizon: float, speed_floor: float) -> None:
 
 
 def version_error(version: str, known: int) -> str:
-    """Return the error message for a file of unsupported format `version`; it names the commit for `known - 1`."""
+    """Return the error message for a file of unsupported `version`, with the commit that reads version `known - 1`."""
     previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
     return f"has version {version}, expected version {known}; {previous}"

@@ -1,4 +1,4 @@
-"""Files with the first non-finite value of a task's term, and the state of its world at that moment."""
+"""Dump files: the first non-finite value of a task's term, such as a reward, and the state of its world."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
 class NonFiniteValue(NamedTuple):
-    """First non-finite value of a term, and the state of its world after that policy step, before a reset."""
+    """First non-finite value of a term, such as a reward, and its world's state after that step, before a reset."""
 
     term: str  # such as `rewards.jump_height`; `terminations.diverged` for the state and the action
     value: float  # NaN or infinite
@@ -50,7 +50,7 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
 
 
 def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
-    """Read the non-finite value, and the header, in a file of `write_dump`.
+    """Read a non-finite value and the header from a file that `write_dump` has written.
 
     Raises InputError: the file is missing, damaged, of another kind or of another version.
     """

@@ -59,7 +59,7 @@ class Metric(NamedTuple):
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit in the name of a metric, such as m/s for `speed_m_s` or `speed [m/s]`; None: none, as a count."""
+    """Return the unit in the name of a metric, such as m/s for `speed_m_s` or `speed [m/s]`; None: it has no unit."""
     return split_unit(key)[1]
 
 
@@ -92,7 +92,7 @@ def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
 
 
 def rate(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the fraction of true values (n,) as a metric with Wilson's 95 % interval; over: what the trials are."""
+    """Return the fraction of true values (n,) as a metric with Wilson's 95 % interval; over: the trials, as text."""
     values = np.asarray(values, dtype=bool)
     n, p = values.size, float(values.mean()) if values.size else None
     if p is None:
@@ -104,7 +104,7 @@ def rate(values: ArrayLike, over: str = "") -> MetricValue:
 
 
 def mean(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the mean of the finite values as a metric with a bootstrap interval; over: what the trials are."""
+    """Return the mean of the finite values as a metric with a bootstrap interval; over: the trials, as text."""
     values = np.asarray(values, dtype=float).ravel()
     known = np.isfinite(values)
     return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
@@ -132,7 +132,7 @@ def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda 
 
 
 def largest(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the largest of the finite values as a metric; over: what the trials are."""
+    """Return the largest of the finite values as a metric; over: the trials, as text."""
     values = np.asarray(values, dtype=float).ravel()
     values = values[np.isfinite(values)]
     return MetricValue(float(values.max()) if len(values) else None, len(values), None, over)

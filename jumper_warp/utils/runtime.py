@@ -113,7 +113,7 @@ def init_warp() -> None:
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the git commit of the source tree in `folder`, by default this package's, which is cached.
+    """Return the git commit of the source tree in `folder`, by default this package's, looked up only once.
 
     None without git, outside a git tree, in a tree without commits, and if the enclosing tree does not track the
     folder, as for a package installed inside another project.
@@ -140,7 +140,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def source_versions() -> dict[str, Any]:
-    """Return by name the git commit of this package (or None), whether files have changed, and versions of packages."""
+    """Return this package's git commit and whether files have changed (None without git), and versions of packages."""
     commit = git_commit()
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 

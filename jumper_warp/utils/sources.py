@@ -57,7 +57,7 @@ def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
 
 
 def own_fault(error: Exception, path: str) -> InputError:
-    """Convert an exception to an InputError with the line of the user's file that raised it; path: of the file."""
+    """Convert an exception to an InputError with the line at which it was raised in the user's file `path`."""
     message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == path]
     if not lines or PLACE.match(message):

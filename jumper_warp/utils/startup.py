@@ -20,7 +20,7 @@ FIRST_COLLECTION_THRESHOLD = 1_200_000
 
 
 class DeferredModule(ModuleType):
-    """Imported module whose code runs at the first access to a name that it lacks until then.
+    """Imported module whose code runs when a name is first read that the import system has not set.
 
     Unlike with `importlib.util.LazyLoader`, `__file__` and other names of the import system do not execute it:
     `inspect` and PyTorch read those of all modules.
@@ -55,7 +55,7 @@ class DeferredLoader(Loader):
         return self.loader.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Make the module a `DeferredModule` instead of running its code; the import system has set its own names."""
+        """Make the module a `DeferredModule` instead of running its code; names such as `__file__` are set already."""
         module.__class__ = DeferredModule
 
 

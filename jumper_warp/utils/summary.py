@@ -37,7 +37,7 @@ def print_summary(
     folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
     flags: PrintFlags | None = None, trial: str = "trial", films: Iterable[Path] = (),
 ) -> None:  # fmt: skip
-    """Print a summary of a run: what was done, its main metrics, and the paths of its files, 80 columns wide.
+    """Print a summary of a run: title, main metrics (by `keys`) and paths of its files, 80 columns wide.
 
     title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
     run; paper: published values by key; flags: print all metrics, or the file itself; trial: noun for the items of

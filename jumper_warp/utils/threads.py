@@ -98,7 +98,7 @@ def set_threads(threads: int | None) -> None:
 
 
 def limit_spinning() -> None:
-    """Let torch's idle CPU threads sleep soon, since the simulation's threads need their cores; call it before torch.
+    """Make torch's idle CPU threads sleep soon, which frees cores for the simulation; call it before importing torch.
 
     libgomp reads the number of rounds when torch is loaded. If that was earlier, `stop_spinning` helps.
     """
@@ -109,7 +109,7 @@ def limit_spinning() -> None:
 
 
 def stop_spinning() -> None:
-    """Limit torch to one CPU thread, once, if its idle threads spin and OMP_NUM_THREADS is not set."""
+    """Limit torch to one CPU thread if its idle threads spin (see `limit_spinning`) and OMP_NUM_THREADS is not set."""
     global _torch_spins
     if _torch_spins and "OMP_NUM_THREADS" not in os.environ:
         sys.modules["torch"].set_num_threads(1)
