@@ -182,8 +182,9 @@ def _summary(metrics: dict[str, float]) -> str:
         parts.append(f"reward {total:.2f}")
     if (success := metrics.get("Metrics/success")) is not None:
         parts.append(f"success {100.0 * success:.1f} %")
-    if levels := level_fractions(metrics):
-        parts.append(f"mean level {sum(i * part for i, part in enumerate(levels)):.1f} of {len(levels) - 1}")
+    if len(levels := level_fractions(metrics)) > 2:  # with a single level there is no curriculum
+        level = f"mean level {sum(i * part for i, part in enumerate(levels)):.1f} of {len(levels) - 1}"
+        parts.append(level if success is None else f"{parts.pop()} at {level}")
     return ", ".join(parts)
 
 

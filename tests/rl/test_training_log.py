@@ -133,8 +133,15 @@ def test_line_shows_steps_mean_curriculum_level_and_time_left(tmp_path, capsys):
     levels = {f"Curriculum/fraction_at_level_{i}": part for i, part in enumerate((0.2, 0.6, 0.2))}
     with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
         log.log(3, METRICS | levels, remaining=240.0)
-    line = "iteration 3/10, 0.15 M steps: 1,234 steps/s, success 50.0 %, mean level 1.0 of 2, 4 min left"
+    line = "iteration 3/10, 0.15 M steps: 1,234 steps/s, success 50.0 % at mean level 1.0 of 2, 4 min left"
     assert capsys.readouterr().err.splitlines() == [line]
+
+
+def test_line_shows_no_level_of_a_task_with_a_single_one(tmp_path, capsys):
+    levels = {"Curriculum/fraction_at_level_0": 1.0, "Curriculum/fraction_at_level_1": 0.0}
+    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
+        log.log(3, METRICS | levels, remaining=240.0)
+    assert "success 50.0 %, 4 min left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("columns", ["60", "150"])
