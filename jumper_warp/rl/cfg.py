@@ -178,8 +178,8 @@ class TrainCfg:
     max_checkpoints: int = 3
     """Number of newest checkpoints to keep; the best checkpoint is never deleted."""
     best_metric: str = "Metrics/success"
-    """Logged metric that selects the best checkpoint; higher is better. Checkpoints saved while most worlds are below
-    the last curriculum level are left out."""
+    """Logged metric whose mean since the checkpoint before selects the best one; higher is better. Checkpoints saved
+    while most worlds are below the last curriculum level are left out."""
     resume: str | None = None
     """Run to continue: its folder, a checkpoint, latest or latest-or-new. `latest` is the task's latest run with a
     checkpoint; `latest-or-new` starts a new run if there is none. `jumper train` uses the saved settings of that run

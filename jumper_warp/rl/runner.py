@@ -171,6 +171,7 @@ class TrainingRun:
         self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
+        self._scores: list[float] = []  # `best_metric` in logged iterations since the last checkpoint
         self.notes: list[str] = []
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
@@ -239,6 +240,7 @@ class TrainingRun:
                 if is_last or logs:
                     (times, seconds), self._is_timed = watch.read(), True
                     self.metrics = self._read_metrics(times)
+                    self._add_score()
                     log.log(self.iteration, self.metrics, self._remaining(seconds))
                 elif self.iteration == first_iteration or not self._is_timed:
                     self._print_speed(log, watch, self.iteration == first_iteration)
@@ -362,11 +364,17 @@ class TrainingRun:
             hint = f", continue with: {self.resume_command}"
             log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 
-    def _score(self) -> float | None:
-        """Return the metric by which the best checkpoint is chosen; None while most worlds are below the last level."""
-        levels = level_fractions(self.metrics)
+    def _add_score(self) -> None:
+        """Add the logged `best_metric` to the scores once half of the worlds have reached the last curriculum level."""
+        levels, score = level_fractions(self.metrics), self.metrics.get(self.cfg.best_metric)
         at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
-        return self.metrics.get(self.cfg.best_metric) if not levels or at_end >= 0.5 else None
+        if score is not None and (not levels or at_end >= 0.5):
+            self._scores.append(score)
+
+    def _score(self) -> float | None:
+        """Return the mean score since the last checkpoint, by which the best one is chosen; None without a score."""
+        scores, self._scores = self._scores, []
+        return sum(scores) / len(scores) if scores else None
 
     @property
     def resume_command(self) -> str:

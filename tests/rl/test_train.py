@@ -376,9 +376,13 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
 
 
 @pytest.mark.parametrize(
-    ("fractions", "score"), [((1.0,), 0.9), ((0.6, 0.3, 0.1, 0.0), None), ((0.1, 0.3, 0.4, 0.2), 0.9), ((), 0.9)]
+    ("fractions", "score"), [((1.0,), 0.8), ((0.6, 0.3, 0.1, 0.0), None), ((0.1, 0.3, 0.4, 0.2), 0.8), ((), 0.8)]
 )
-def test_checkpoint_has_a_score_once_half_of_the_worlds_are_at_the_last_level(fractions, score):
+def test_checkpoint_has_the_mean_score_once_half_of_the_worlds_are_at_the_last_level(fractions, score):
     levels = {f"Curriculum/fraction_at_level_{i}": fraction for i, fraction in enumerate(fractions)}
-    run = SimpleNamespace(metrics={"Metrics/success": 0.9, **levels}, cfg=TrainCfg(task="t"))
-    assert TrainingRun._score(run) == score
+    run = SimpleNamespace(cfg=TrainCfg(task="t"), _scores=[])
+    for success in (0.9, 0.7):
+        run.metrics = {"Metrics/success": success, **levels}
+        TrainingRun._add_score(run)
+    assert TrainingRun._score(run) == (score and pytest.approx(score))
+    assert TrainingRun._score(run) is None  # no value since the checkpoint before
