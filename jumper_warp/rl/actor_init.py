@@ -1,4 +1,4 @@
-"""Initialisation of an actor from a trained policy instead of random weights."""
+"""Initial weights and observation statistics of an actor, taken from a trained policy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SYMMETRY_TOLERANCE = 0.05
 
 
 class ActorInit(NamedTuple):
-    """Weights and observation statistics (mean, standard deviation) with which the training of an actor starts."""
+    """Initial weights and observation statistics (mean, standard deviation) of an actor, from a trained policy."""
 
     layers: Weights  # weight (out, in) and bias (out,) of each layer
     mean: torch.Tensor  # (num_obs,) mean of raw observations
@@ -32,10 +32,10 @@ def make_actor_init(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
     symmetry: Symmetry | None = None,
 ) -> ActorInit:  # fmt: skip
-    """Return initial weights and statistics that make a training's actor, with settings `cfg`, equal to a policy.
+    """Return initial weights and observation statistics, from a trained policy, of an actor with settings `cfg`.
 
-    With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric policy; any other
-    becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
+    Without `symmetry` the actor equals the policy. With it, a policy g that is nearly mirror-symmetric is projected to
+    the nearest symmetric policy; any other becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
     layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: the
     task's mirror maps if cfg.symmetry is "actor", else None.
     Raises InputError: hidden layers or activation differ from the settings, or std is below sqrt(VARIANCE_EPS).

@@ -105,12 +105,12 @@ def _decoded(path: Path, data: bytes) -> Any:
 
 
 def one_line_message(error: Exception) -> str:
-    """Return an error's message on one line of at most 300 characters; its type's name if it is empty."""
+    """Return an error's message as one line of at most 300 characters, or its type's name if the message is empty."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
-    """Load the last undamaged checkpoint in a folder, and return it. Raises CheckpointError: there is none."""
+    """Load and return the most recently saved usable checkpoint of a folder. Raises CheckpointError: there is none."""
     manifest = _read_manifest(folder)
     skipped: list[str] = []
     for name in reversed(manifest):
@@ -122,14 +122,17 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
 
 
 def newest_name(folder: Path) -> str:
-    """Return the file name of a folder's newest checkpoint, usable or not. Raises CheckpointError: there is none."""
+    """Return the file name of a folder's last saved checkpoint, even if damaged.
+
+    Raises CheckpointError: there is none.
+    """
     if not (manifest := _read_manifest(folder)):
         raise CheckpointError(f"{folder}: no checkpoint")
     return list(manifest)[-1]
 
 
 def best_checkpoint(folder: Path) -> Path:
-    """Return the path of the checkpoint with the highest score; on a tie or without scores, the last saved one.
+    """Return the path of a folder's checkpoint with the highest score; on a tie or without scores, the last saved one.
 
     Raises CheckpointError: there is none.
     """

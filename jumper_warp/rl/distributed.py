@@ -37,7 +37,7 @@ def all_reduce_max(values: list[int]) -> list[int]:
 
 
 def all_ranks_agree(agreed: bool) -> bool:
-    """Return whether `agreed` is true in all processes (blocking)."""
+    """Return whether every process passes True; blocks until all processes have called."""
     return all_reduce_max([int(not agreed)]) == [0]
 
 
@@ -48,7 +48,7 @@ def same_on_all_ranks(text: str) -> bool:
 
 
 def local_rank_zero_first(procedure: Callable[[], None]) -> None:
-    """Run a procedure on local rank 0 of each machine, then on the other ranks, which read the files it cached."""
+    """Run a procedure on local rank 0 of each machine, then on the others, where it can use cached files."""
     if world_size() == 1:
         procedure()
         return
@@ -103,7 +103,7 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
 
 
 def gather_states(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
-    """Return the states (nested dicts of tensors) of all ranks, in their order, on rank 0; an empty list elsewhere."""
+    """Return, on rank 0, the states (nested dicts of tensors) of all ranks in order; on other ranks, an empty list."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)

@@ -34,11 +34,11 @@ class Segment(NamedTuple):
         return aligned(math.prod(self.padded_shape), ALIGNMENT)
 
     def padded_view(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return this parameter's part of a flat vector as a view of `padded_shape`."""
+        """Return a view of this parameter's entries in a flat vector, with the shape `padded_shape`."""
         return vector[self.start : self.start + math.prod(self.padded_shape)].view(self.padded_shape)
 
     def view(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return this parameter's part of a flat vector as a view of `shape`, without padding."""
+        """Return a view of this parameter's entries in a flat vector, without padding, with the shape `shape`."""
         view = self.padded_view(vector)
         return view[:, : self.shape[1]] if len(self.shape) == 2 else view
 
@@ -84,7 +84,7 @@ class FlatParameters:
 
 
 def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
-    """Join the gradients of consecutive parameters, with their padding, to one slice of the flat gradient vector."""
+    """Concatenate gradients of consecutive parameters to one vector, each zero-padded to a multiple of ALIGNMENT."""
     pieces = []
     for gradient in gradients:
         pieces.append(gradient.flatten())
@@ -139,7 +139,7 @@ class FlatAdam:
 
 
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
-    """Return the learning rate () adapted to the KL divergence of the policy update.
+    """Return the learning rate (), lowered if the KL divergence of the policy update is too large, raised if too small.
 
     It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A smaller kl
     than 1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within

@@ -1,4 +1,4 @@
-"""Capture of procedures as CUDA graphs."""
+"""Capture of repeated procedures as CUDA graphs, which later calls replay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jumper_warp.rl.distributed import all_ranks_agree, wait_for_ranks
 
 
 class CapturedProcedure:
-    """Procedure that runs eagerly once; if enabled, it is then captured and replayed as a CUDA graph.
+    """Procedure that runs eagerly in its first call and, if enabled, as a captured CUDA graph in all later calls.
 
     If the capture fails on any rank, all ranks run the procedure eagerly, and print a warning.
     """

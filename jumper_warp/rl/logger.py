@@ -21,7 +21,7 @@ from jumper_warp.utils.progress import format_duration
 
 
 class Stopwatch:
-    """Stopwatch for the device time of each part of a training iteration (lap); only `read` waits for the device."""
+    """Stopwatch for the device time of the parts of each training iteration (or lap); only `read` synchronises."""
 
     def __init__(self, device: torch.device) -> None:
         """Measure the time of `device`, with CUDA events on a GPU and the host's clock on a CPU."""
@@ -41,7 +41,7 @@ class Stopwatch:
         self._laps[-1].append(mark)
 
     def lap_time(self) -> float:
-        """Return the time from the beginning of the current lap to its last mark [s]; 0 on a GPU."""
+        """Return the time from the start of the current lap to its last mark [s] on a CPU, and 0 on a GPU."""
         return 0.0 if self._cuda else self._laps[-1][-1] - self._laps[-1][0]
 
     def read(self) -> tuple[list[float], float]:
@@ -106,7 +106,7 @@ class TrainingLog:
             self._wandb.finish()
 
     def print_line(self, line: str) -> None:
-        """Print a line above the progress bar; an OSError is ignored, since there is nowhere to report it."""
+        """Print a line above the progress bar; a failure to print it (OSError) is ignored."""
         with suppress(OSError):
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
@@ -146,7 +146,7 @@ class TrainingLog:
             self._expected_rate = 0.0
 
     def move(self, folder: Path) -> None:
-        """Copy the metrics file, even a deleted one, to a folder and use the copy; end TensorBoard. Raises OSError."""
+        """Continue the log in a new folder: copy the metrics file, even if deleted; end TensorBoard. Raises OSError."""
         self._file = self._file.move(folder / METRICS_FILE)
         self._events = None
 
@@ -171,7 +171,7 @@ class _PipeSafeConsole(Console):
     """Console that stops printing on a broken pipe, where `rich.console.Console` would end the process."""
 
     def on_broken_pipe(self) -> None:
-        """Stop printing after a broken pipe; called by rich."""
+        """Disable all further output; rich calls this method after a broken pipe."""
         self.quiet = True
 
 
@@ -189,7 +189,7 @@ def _summary(metrics: dict[str, float]) -> str:
 
 
 def level_fractions(metrics: dict[str, float]) -> list[float]:
-    """Return the fraction of the worlds at each curriculum level, and of those that passed the last one; [] if none."""
+    """Return the fraction of worlds at each curriculum level and, last, of those that passed all; [] if not logged."""
     return [value for name, value in metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
 
 

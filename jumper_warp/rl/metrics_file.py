@@ -13,7 +13,7 @@ METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object p
 
 
 class MetricsFile:
-    """File of a training's metrics with atomic appends; lines that were not written are appended with the next one."""
+    """Metrics file of a training that appends whole lines or nothing; a failed line is written with the next one."""
 
     def __init__(self, path: Path, iteration: float) -> None:
         """Open the metrics file to continue after `iteration`; later iterations and malformed lines are removed.
@@ -52,7 +52,7 @@ class MetricsFile:
         self._size, self._pending = self._size + written, b""
 
     def move(self, path: Path) -> MetricsFile:
-        """Copy the lines to `path`, close this file, even if it was deleted, and return the copy. Raises OSError."""
+        """Copy all lines, even of a deleted file, to `path`; close this file, return the new one. Raises OSError."""
         self._file.seek(0)
         write_atomically(path, self._file.read())
         self.close()

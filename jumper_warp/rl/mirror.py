@@ -1,4 +1,4 @@
-"""Left-right symmetry of the actor.
+"""Left-right symmetric actor: mirror maps, and conversion of its network to and from a plain network.
 
 A mirror map takes a vector x to its mirror image `signs * x[order]`; it is its own inverse. Let M be the mirror map of
 observations, N the mirror map of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2. For any
@@ -114,7 +114,7 @@ def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers, nearest to given ones by least squares, of a symmetric actor as a plain network.
+    """Project the layers of a plain network to the nearest ones (least squares) that represent a symmetric actor.
 
     layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, the others set to 0.
     """
@@ -132,9 +132,9 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Recover a symmetric actor's network, of half the widths, from the layers of its equivalent plain network.
+    """Recover the layers of a symmetric actor's network f from its equivalent plain network of twice the widths.
 
-    The result is a copy of the layers of f.
+    The result is a copy.
     f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.
     """
     contracted = []

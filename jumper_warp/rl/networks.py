@@ -70,7 +70,7 @@ class Scaling(NamedTuple):
 
 
 def all_reduce_moments(local: Sequence[Moments]) -> list[Moments]:
-    """Combine means and variances of the batches of all ranks in one all-reduce, and return them as float64.
+    """Combine the moments of each quantity over the batches of all ranks, in one all-reduce; return them in float64.
 
     local: moments of quantities of any shape over this rank's batch, which has the same size on every rank. In float64
     the cancellation in E[x²] - E[x]² is negligible.
@@ -103,7 +103,7 @@ def gaussian_kl(
 
 
 class RunningMoments(nn.Module):
-    """Running mean and variance of all samples so far, float64 buffers; the initial scaling is the identity."""
+    """Running mean and variance of all samples so far, in float64; before the first sample, scaling has no effect."""
 
     mean: torch.Tensor  # shape of one sample
     var: torch.Tensor  # shape of one sample, population variance
@@ -208,7 +208,7 @@ class ActorCritic(nn.Module):
         return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
-        """Return the critic's output (...) [std of the return] for normalised observations (..., num_critic_obs)."""
+        """Return the critic's output (...), a normalised return, for normalised observations (..., num_critic_obs)."""
         return self.critic(critic_features).squeeze(-1)
 
     def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
@@ -255,7 +255,7 @@ class Layers(NamedTuple):
 
 
 class ActorTensors(NamedTuple):
-    """Policy network as tensors, with a forward and a backward pass; notation of `jumper_warp.rl.mirror`."""
+    """Policy network as tensors, with forward and backward pass without autograd (symbols: `jumper_warp.rl.mirror`)."""
 
     layers: Layers
     log_std: torch.Tensor  # (num_actions,) of the exploration noise
@@ -283,7 +283,7 @@ class ActorTensors(NamedTuple):
 
 
 class ActorOutput(NamedTuple):
-    """Result of the policy's forward pass: mean action, its left-right asymmetry, and the layers' inputs."""
+    """Result of the policy's forward pass: mean action, its deviation from mirror symmetry, and the layers' inputs."""
 
     mean: torch.Tensor  # (batch, num_actions)
     difference: torch.Tensor  # (batch, num_actions) f(x) - N f(M x); 0 without symmetry

@@ -1,7 +1,8 @@
-"""Proximal policy optimisation (PPO). An iteration is `collect`, then `update`: CUDA graphs on a GPU, eager on a CPU.
+"""Proximal policy optimisation (PPO) with normalised observations, returns and advantages.
 
-There is no host synchronisation within an iteration. Surrogate: Schulman et al. 2017; advantage: Schulman et al. 2016.
-Observations, returns and advantages are normalised; the learning rate adapts to the KL divergence.
+An iteration is `collect`, then `update`: CUDA graphs on a GPU, eager on a CPU. There is no host synchronisation within
+an iteration. Surrogate: Schulman et al. 2017; advantage: Schulman et al. 2016. The learning rate adapts to the KL
+divergence.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from jumper_warp.utils.state_checks import check_parts, check_tensor, check_valu
 
 
 class ActorLosses(NamedTuple):
-    """PPO's surrogate loss, entropy, asymmetry and KL divergence on a minibatch, each a scalar tensor ()."""
+    """PPO's surrogate loss, and entropy, left-right asymmetry and KL divergence of the policy, on a minibatch."""
 
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     entropy: torch.Tensor  # entropy of the policy [nat]
@@ -95,14 +96,14 @@ class Ppo:
         self._roll, self._batch, self._optimise = (CapturedProcedure(each, cuda and cfg.graphs) for each in procedures)
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
-        """Collect a rollout, and update the networks on it; mark: called after the launch of each of the two."""
+        """Collect a rollout, and update the networks on it; call `mark` after launching each of the two."""
         self.collect()
         mark()
         self.update()
         mark()
 
     def collect(self) -> None:
-        """Run the current policy in the environment, and record its steps in the rollout."""
+        """Run the current policy in the environment for one rollout, and store all transitions in `rollout`."""
         self._roll()
 
     def update(self) -> None:
@@ -115,9 +116,9 @@ class Ppo:
 
     @torch.no_grad()
     def batch(self) -> Batch:
-        """Compute the rollout's training samples, return views of them, time-major, and update the running moments.
+        """Compute and return the rollout's training samples, time-major, and update the normalisation statistics.
 
-        The views are of `packer.rows`.
+        The samples are views of `packer.rows`.
         Also samples the order of the samples in every epoch.
         """
         self.packer.pack()
@@ -156,9 +157,10 @@ class Ppo:
         )
 
     def set_progress(self, progress: float) -> None:
-        """Set desired KL and entropy coefficient for the training's progress (0 to 1), without synchronisation.
+        """Set the desired KL divergence and the entropy coefficient for the training's progress (0: start, 1: end).
 
-        Both are constant in the first half, and interpolated linearly to their final values in the second half.
+        Both are constant in the first half, and interpolated linearly to their final values in the second half. Does
+        not synchronise with the device.
         """
         cfg, decay = self.cfg, min(max(2.0 * progress - 1.0, 0.0), 1.0)
         self._desired_kl.fill_((1.0 - decay) * cfg.desired_kl + decay * min(cfg.final_desired_kl, cfg.desired_kl))
@@ -275,10 +277,10 @@ def optimiser_step(
     vectors: AdamVectors, actor_size: int, kl: torch.Tensor, desired_kl: torch.Tensor, cfg: PpoCfg, losses: ActorLosses,
     value_loss: torch.Tensor, sums: torch.Tensor,
 ) -> StepStatistics:  # fmt: skip
-    """Adapt the learning rate to the divergence kl (), clip the gradient, run Adam's step, and return losses and norms.
+    """Run one step of Adam with an adapted learning rate and a clipped gradient; return losses and gradient norms.
 
-    A non-finite gradient is replaced by 0. sums: (len(STATISTICS) + 1,) running sums of the statistics, and the number
-    of steps; updated in place.
+    The rate adapts to the KL divergence kl (). A non-finite gradient is replaced by 0. sums: (len(STATISTICS) + 1,)
+    running sums of the statistics, and the number of steps; updated in place.
     """
     vectors.lr.copy_(adapted_lr(vectors.lr, kl, cfg, desired_kl))
     norms = clip_gradient(vectors.gradient, actor_size, cfg.max_grad_norm)

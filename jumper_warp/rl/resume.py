@@ -34,7 +34,7 @@ DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's confi
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Load the checkpoint that `TrainCfg.resume` names; None: new run. Raises CheckpointError: it cannot be used."""
+    """Load and return the checkpoint that `TrainCfg.resume` selects; None: start a new run. Raises CheckpointError."""
     if not cfg.resume:
         return None
     if cfg.resume in (LATEST, LATEST_OR_NEW):
@@ -62,7 +62,7 @@ def check_unchanged(checkpoint: Checkpoint) -> None:
 
 
 def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
-    """Return the part of a checkpoint that one process (rank) restores: `env`, `rng` and its part of `ppo`.
+    """Return the state that one process (rank) restores from a checkpoint, with the entries `env`, `rng` and `ppo`.
 
     Raises InputError: another number of processes saved the checkpoint, or a part is missing.
     """
@@ -79,7 +79,7 @@ def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
 
 
 def saved_init_policy(state: dict[str, Any]) -> str | None:
-    """Return the policy from which the training that saved a checkpoint started; None: random weights or unknown."""
+    """Return the policy from which a checkpoint's training started (setting `init_policy`); None: none or unknown."""
     try:
         settings = json.loads(state["config"])["train"]
         return str(settings["init_policy"]) if settings.get("init_policy") else None
@@ -88,7 +88,7 @@ def saved_init_policy(state: dict[str, Any]) -> str | None:
 
 
 def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """List the settings that differ between a checkpoint's configuration and `config`, as lines `flag old -> new`.
+    """List the settings that differ between a checkpoint's configuration and `config`, one line `name old -> new` each.
 
     Empty if the checkpoint has no readable configuration.
     """

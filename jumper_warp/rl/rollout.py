@@ -13,7 +13,7 @@ from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
 
 
 class RolloutBuffer(NamedTuple):
-    """Transitions (observations, action, reward, end) of all worlds over num_steps policy steps."""
+    """Transitions (observations, action, reward, done) of all worlds over num_steps policy steps."""
 
     obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
     critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs without `asymmetric_critic`
@@ -107,7 +107,7 @@ def record_transition(
     reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
     step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
 ) -> None:  # fmt: skip
-    """Write reward, done, timeout and the critic's final observation to `step`; update returns and lengths of episodes.
+    """Write the results of an environment step to `step` of the rollout; update returns and lengths of episodes.
 
     reward, done, timeout: (num_envs,), unscaled; final_critic_obs: (num_envs, n). episode: (2, num_envs) and finished:
     (3, num_envs), as in `Collector`, are updated in place with unscaled rewards.

@@ -14,7 +14,7 @@ from jumper_warp.rl.cfg import PpoCfg
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
-    """Return PPO settings as a configuration of rsl-rl, which has no value normalisation and no reward scale.
+    """Convert PPO settings to a configuration of rsl-rl, without value normalisation and reward scale.
 
     The environment must have the observation groups `actor` and `critic`. save_interval: iterations per checkpoint.
     """

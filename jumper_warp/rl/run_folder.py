@@ -1,4 +1,4 @@
-"""Folder of a run: its creation and configuration, dumps of non-finite values, and its rescue if it is deleted."""
+"""Folder of a training run: creation, configuration, dumps of non-finite values, replacement if files are deleted."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 def report_non_finite(
     env: VecEnv, folder: Path, config: dict[str, Any], iteration: int, print_line: Callable[[str], None], rank: int = 0
 ) -> list[NonFiniteValue]:
-    """Print a line about each task term that is non-finite for the first time, save a dump, and return the values.
+    """For each task term that is non-finite for the first time, print a line and save a dump file; return their values.
 
     config: of the run; rank: index of this process. A dump that cannot be written is reported in the line.
     """
@@ -71,7 +71,7 @@ def report_non_finite(
 
 
 def rescue_folder(folder: Path, config: dict[str, Any], names: Iterable[str]) -> tuple[Path, str]:
-    """Make a new folder for a training run if one of its files `names` was deleted; return the folder and a message.
+    """Return the folder in which a training run continues, a new one if any file of `names` was deleted, and a message.
 
     If none was, return `folder` and an empty message.
     The new folder is made beside the old one, with the configuration. Raises OSError: it cannot be written.

@@ -1,4 +1,4 @@
-"""Conversion of a rollout to a training batch: values, advantages (GAE) and returns, one row of memory per sample."""
+"""Conversion of a rollout to training samples with values, advantages (GAE) and returns, one per row of a matrix."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Scalings(NamedTuple):
 
 
 class RowLayout(NamedTuple):
-    """Layout of one training sample in a row of memory: actor features, critic features, other data of `Batch`.
+    """Layout of one training sample in a row of a matrix: actor features, critic features, other data of `Batch`.
 
     Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once per iteration and gathered
     once per epoch.
@@ -132,7 +132,7 @@ def gae(
 
 
 class BatchPacker:
-    """Converter of a rollout to PPO's training samples, with advantages and returns, one in each row of `rows`."""
+    """Converter of a rollout to PPO's training samples, with advantages and returns, one per row of `rows`."""
 
     def __init__(
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
@@ -153,7 +153,7 @@ class BatchPacker:
 
     @torch.no_grad()
     def pack(self) -> None:
-        """Compute advantages and returns, write the rollout's samples to `rows`, and update the running moments."""
+        """Compute advantages and returns, write the samples to `rows`, and update the normalisation statistics."""
         model = self._model
         scalings = self._scalings()  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
@@ -217,7 +217,7 @@ def write_rows(
     rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
     advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
-    """Write a rollout's normalised training samples to memory, one per row: rows (batch, columns of `layout`).
+    """Normalise a rollout's training samples, and write them to `rows` (batch, columns of `layout`), one per row.
 
     chunk_size: samples packed at a time (None: all).
     scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.

@@ -28,7 +28,7 @@ STATISTICS = ("actor", "value", "gradient_actor", "gradient_critic")
 
 
 class Window(NamedTuple):
-    """Actor loss of a short window of simulation, and the window's samples for the critic."""
+    """Result of a window of a few policy steps of all worlds: the actor's loss, and samples for training the critic."""
 
     loss: torch.Tensor  # () actor loss, differentiable
     obs: torch.Tensor  # (num_steps, num_envs, num_obs)
@@ -84,7 +84,7 @@ class Shac:
         self._sums += torch.tensor([float(window.loss.detach()), value_loss, actor_norm, critic_norm, 1.0]).double()
 
     def window(self) -> Window:
-        """Simulate the policy for `num_steps` steps; return the actor's loss and the critic's samples."""
+        """Simulate a window of `num_steps` policy steps; return the actor's loss and samples to train the critic."""
         env, cfg, model = self.env, self.cfg, self.model
         samples: list[tuple[torch.Tensor, ...]] = []
         discount, total = torch.ones(env.num_envs, device=env.device), torch.zeros(env.num_envs, device=env.device)
@@ -167,7 +167,7 @@ class Shac:
         return norm
 
     def set_progress(self, progress: float) -> None:
-        """Set the actor's learning rate for the training's progress (0 to 1)."""
+        """Set the actor's learning rate, which falls linearly with the training's progress (0 to 1) to a tenth."""
         self.lr.fill_(self.shac.lr * (1.0 - 0.9 * min(max(progress, 0.0), 1.0)))
 
     def statistics(self) -> dict[str, float]:

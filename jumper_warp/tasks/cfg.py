@@ -60,7 +60,7 @@ class Reset(Copyable):
 
 @dataclass(frozen=True)
 class Command(Copyable):
-    """Functions that set a task's command from outside and resample it within an episode."""
+    """Functions that set a task's command to given values and resample it within an episode."""
 
     set: Function
     """Function that sets a command: @wp.func (robot, scene: Scene, state, values: wp.vec4, heading) -> state.
@@ -201,7 +201,7 @@ class TaskCfg(Copyable):
         return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
-        """Return the half-open column range (first, end) of each term in the actor's or critic's observation, by name.
+        """Return the columns of each term in the actor's or critic's observation as half-open ranges (first, end).
 
         group: "actor" or "critic".
         """
@@ -253,7 +253,7 @@ class TaskCfg(Copyable):
 
     @property
     def draws_ground(self) -> bool:
-        """Whether resets sample ground other than a plane."""
+        """Whether resets sample ground other than a plane, such as platforms."""
         return bool(getattr(self.reset.settings, "draws_ground", False))
 
     @property
@@ -274,13 +274,13 @@ class TaskCfg(Copyable):
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))
 
     def nominal(self) -> TaskCfg:
-        """Return a copy of the task without randomisation and without events."""
+        """Return a copy of the task with nominal robot parameters: without randomisation and events."""
         return replace(self, randomization=RandomizationCfg.off(), events=())
 
 
 @dataclass(frozen=True)
 class Handover(Copyable):
-    """Switch of a world from one task to another, with its condition; the robot's state does not change."""
+    """Rule that switches a world from a source to a target task on a condition; the robot's physical state is kept."""
 
     source: TaskCfg
     target: TaskCfg

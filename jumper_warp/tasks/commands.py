@@ -1,4 +1,4 @@
-"""Layouts of the tasks' commands, and checks of commands that users pass."""
+"""Layouts of the tasks' commands (such as goals and velocities), and checks of commands that users pass."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jumper_warp.utils.kernels import Function
 
 @dataclass(frozen=True)
 class CommandValue:
-    """One component of a task's command: name, lower bound, and whether it may be omitted."""
+    """One number of a task's command: its name with unit, lower bound, and whether it may be omitted."""
 
     name: str  # With its unit, as `x [m]`
     least: float = -math.inf  # Smallest allowed number, in its unit
@@ -26,7 +26,7 @@ class CommandValue:
 
 @dataclass(frozen=True)
 class CommandLayout:
-    """Layout of a task's command (such as a goal): its one to four components, in order."""
+    """Layout of a task's command, such as a goal position: the one to four numbers of which it consists, in order."""
 
     values: tuple[CommandValue, ...]
     nonzero: bool = False  # Whether at least one number must differ from 0

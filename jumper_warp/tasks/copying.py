@@ -1,4 +1,4 @@
-"""Copies and pickles of tasks and their parts, whose Warp functions and structs are pickled by name."""
+"""Copying and pickling of tasks and their parts; pickles refer to Warp functions and structs by name."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Reference(NamedTuple):
 
     @classmethod
     def to(cls, definition: Any) -> Reference:
-        """Return the reference to a function or struct. Raises pickle.PicklingError: it is not at the top level."""
+        """Return the reference to a function or struct. Raises PicklingError: not at the top level of its module."""
         module, module_name, name = top_level(definition)
         if module is None:
             raise pickle.PicklingError(
@@ -63,7 +63,7 @@ class Reference(NamedTuple):
         return cls(module_name, name, getattr(module, "__file__", None))
 
     def definition(self) -> Any:
-        """Import the module, and return the named function or struct. Raises ImportError or AttributeError: none."""
+        """Import and return the referenced function or struct. Raises ImportError or AttributeError: not found."""
         try:
             module = sys.modules.get(self.module) or importlib.import_module(self.module)
         except ModuleNotFoundError:

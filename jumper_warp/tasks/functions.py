@@ -53,10 +53,10 @@ def shown_type(kind: Any) -> str:
 def check_function(
     where: str, func: Any, takes: Sequence[Any], returns: str, may_return: Callable[[Any], bool]
 ) -> None:
-    """Raise InputError, with file and line, unless a function takes arguments of types `takes` and its result is valid.
+    """Raise InputError, with file and line, unless a Warp function has argument types `takes` and a valid return type.
 
-    The body is checked of functions from outside the project. where: part of the task, for messages. returns: type of
-    the result in words; may_return: whether a type is valid.
+    Body and return type are checked only of functions from outside the project. where: part of the task, for messages.
+    returns: type of the result in words; may_return: whether a type is valid.
     """
     name, actual = func.key.rsplit(".", 1)[-1], list(func.input_types.values())
     if len(actual) != len(takes):
@@ -77,7 +77,7 @@ def check_function(
 
 
 def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
-    """Raise InputError, with file and line, unless a function takes arguments `takes` and returns `returns` (types)."""
+    """Raise InputError, with file and line, unless a function has argument types `takes` and return type `returns`."""
     where = f"{where} {func.key.rsplit('.', 1)[-1]}"
     check_function(where, func, takes, shown_type(returns), lambda kind: SAME.get(kind, kind) is returns)
 
@@ -96,7 +96,10 @@ def _returned(func: wp.Function, takes: tuple[Any, ...]) -> Any:
 
 
 def check_values(where: str, settings: Any, *args: float) -> None:
-    """Raise InputError unless settings have a Warp struct, `struct`, and `values(*args)` returns an instance of it."""
+    """Raise InputError unless `settings.struct` is a Warp struct, and `settings.values(*args)` returns an instance.
+
+    The instance is checked only of settings from outside the project.
+    """
     struct, values = getattr(settings, "struct", None), getattr(settings, "values", None)
     if not isinstance(struct, Struct) or not callable(values):
         raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")

@@ -1,4 +1,4 @@
-"""Inputs and outputs of a task's policies, as plain data that is saved with every policy."""
+"""Description of the inputs and outputs of a task's policies, as plain data that is saved with every policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 
 
 def interface(task: TaskCfg) -> dict[str, Any]:
-    """Return the inputs and outputs of a task's policies as JSON data; lists of 12 are in the order of `joint_names`.
+    """Describe inputs and outputs of a task's policies as JSON data; lists of 12 are in the order of `joint_names`.
 
     Units: action_scale, default_joint_pos [rad]; joint_stiffness [N m/rad]; joint_damping [N m s/rad]; torque_limit
     [N m]; command_filter [deg], [deg/s] and [s]. observation_layout: half-open column range by term.

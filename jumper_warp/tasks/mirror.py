@@ -1,4 +1,4 @@
-"""Left-right mirror images of observations and actions, as permutations and signs.
+"""Left-right mirror maps of observations and actions, as permutations and signs.
 
 `signs * x[order]` is the observation x, or the action, of the robot mirrored about its x-z plane. Lateral angles are
 positive outward, and transversal angles away from the leg's other link, so motors swap sides and keep their signs.
@@ -19,7 +19,7 @@ from jumper_warp.utils.errors import InputError
 
 
 class Mirror(NamedTuple):
-    """Left-right mirror image of a vector x, as permutation and signs: `signs * x[order]`."""
+    """Left-right mirror map: a permutation and signs; the mirror image of a vector x is `signs * x[order]`."""
 
     order: np.ndarray  # (columns,) int, source column of each column
     signs: np.ndarray  # (columns,) float32, 1 or -1
@@ -50,7 +50,7 @@ _SWAPPED: dict[Any, tuple[int, ...]] = {
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the left-right mirror image of a task's observation, as permutation and signs; group: "actor" or "critic".
+    """Return the left-right mirror map of a task's observation; group: "actor" or "critic".
 
     Raises InputError: unknown term.
     """
@@ -72,5 +72,5 @@ def mirror_of(task: TaskCfg, group: str) -> Mirror:
 
 
 def mirror_of_action() -> Mirror:
-    """Return the left-right mirror image of an action (12,), in motor order, as permutation and signs."""
+    """Return the left-right mirror map of an action (12,), in motor order."""
     return Mirror(np.array(MOTORS), np.ones(12, dtype=np.float32))

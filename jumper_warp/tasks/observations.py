@@ -1,4 +1,4 @@
-"""Observation terms that the tasks share, with the standard deviations of the paper's Table VI."""
+"""Observation terms that several tasks share, with the noise standard deviations of the paper's Table VI."""
 
 from dataclasses import replace
 
@@ -39,12 +39,12 @@ REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
 
 
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
-    """Return observation terms, in which those of motion, angles and action have a history of `steps` policy steps."""
+    """Return copies of observation terms; those named in REMEMBERED get a history of `steps` policy steps."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
 
 
 def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
-    """Return a task whose actor observes motion, angles and action over `steps` policy steps; None: unchanged."""
+    """Return a task whose actor observes the terms REMEMBERED over `steps` policy steps; None: the task unchanged."""
     if steps is None:
         return task
     return replace(task, observations=replace(task.observations, actor=remembered(task.observations.actor, steps)))

@@ -1,4 +1,4 @@
-"""Randomisation ranges of a task for a robot whose values differ from the description (robot overlay).
+"""Randomisation ranges of a task for a robot overlay, whose values differ from the robot description.
 
 Each sampled parameter varies around the overlay's value by as much as the task's range varies around the described
 value: factors and additive ranges apply to the overlay's value, and the absolute ranges in `MOVED` are moved by the
@@ -35,7 +35,7 @@ UNITS = {
 
 
 class RangeMoves(NamedTuple):
-    """Differences of a robot overlay's values from the description, by which absolute randomisation ranges move."""
+    """Offsets by which a robot overlay shifts absolute randomisation ranges: its values minus the described ones."""
 
     motor_friction: tuple[float, ...] = 12 * (0.0,)  # [N m]
     dynamic_friction: float = 0.0  # [1]
@@ -46,7 +46,7 @@ class RangeMoves(NamedTuple):
 
 
 def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
-    """Return how far a robot overlay moves a task's randomisation ranges; 0 where it has no value, or its own range."""
+    """Return the offsets by which an overlay shifts randomisation ranges; 0 where it has no value, or its own range."""
     if overlay is None:
         return RangeMoves()
     described, own, moves = vars(RobotValues.nominal(1)), overlay.randomization, {}
@@ -114,7 +114,7 @@ def range_words(task: TaskCfg, overlay: RobotOverlay | None, *, changed: bool = 
 def with_flagged_ranges(
     task: TaskCfg, flagged: TaskCfg, overlay: RobotOverlay, names: Collection[str]
 ) -> tuple[TaskCfg, RobotOverlay]:
-    """Return a task and a robot overlay in which randomisation ranges that a user sets replace those of both.
+    """Return a task and a robot overlay in which the randomisation ranges `names` are those that a user has set.
 
     flagged: the task with the user's ranges. names: of these ranges. An absolute range of the user is the overlay's
     own, so that it is not moved.
@@ -129,7 +129,7 @@ def with_flagged_ranges(
 def with_fixed_ranges(
     overlay: RobotOverlay | None, fixed: Mapping[str, tuple[float, float]], *, nominal: bool
 ) -> RobotOverlay | None:
-    """Return a robot overlay with given randomisation ranges, which are added to its own or replace them.
+    """Return a robot overlay with its own randomisation ranges and those of `fixed`, which take precedence.
 
     nominal: drop its own ranges, and fix the friction of the paws at its value.
     fixed: (lower, upper) by field of `RandomizationCfg`.

@@ -20,7 +20,7 @@ from jumper_warp.utils.threads import locked
 
 
 class TermSlot(SimpleNamespace):
-    """Indices of a term's parameters (such as a reward's weight) in the task's parameter array, and its options.
+    """Indices of a term's parameters (such as a reward's weight) in the task's parameter array, and the term's options.
 
     Kernels use it; the array p is that of `TaskParams.values`. Each name in the term's `settings` is an attribute, the
     index of its value (of a pair: the first): `p[slot.weight]`. Each name in its `options` is an attribute with the
@@ -69,7 +69,7 @@ class TaskParams:
 
 
 class ParamArrays:
-    """Device array of the parameters of a task's terms, which can change while captured CUDA graphs read it."""
+    """Device array of the parameters of all terms of a task; values can change while captured CUDA graphs read them."""
 
     def __init__(self, params: TaskParams, device: Any) -> None:
         """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""

@@ -109,7 +109,10 @@ class RandomizationCfg:
 
     @classmethod
     def off(cls) -> RandomizationCfg:
-        """Return a configuration with every range None, and push_probability 1 for pushes that a caller adds."""
+        """Return a configuration without randomisation: all ranges are None.
+
+        push_probability is 1, for pushes that a caller adds.
+        """
         ranges = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
         off: dict[str, Any] = dict.fromkeys(ranges)
         return cls(**off, push_probability=1.0)
@@ -136,12 +139,12 @@ class RandomizationCfg:
         return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
 
     def in_tests(self) -> RandomizationCfg:
-        """Return the randomisation ranges for evaluation: sampled at every reset, with pushes at intervals."""
+        """Return a copy for evaluation: parameters are sampled at every reset, and pushes at intervals."""
         timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_probability": PUSH_PROBABILITY}
         return replace(self, resample_at="reset", **timing)
 
     def with_fixed(self, **values: Any) -> RandomizationCfg:
-        """Return a copy with constant parameters, see `fixed_ranges`. Raises InputError: a value out of range."""
+        """Return a copy with the ranges of `fixed_ranges(**values)`. Raises InputError: a value is out of range."""
         return replace(self, **fixed_ranges(**values))
 
     def events(self) -> tuple[EventTerm, ...]:

@@ -1,4 +1,4 @@
-"""Checks of configurations of numbers and ranges, and their conversion to kernel structs with the same fields."""
+"""Checks of settings dataclasses of numbers and ranges, and their conversion to kernel structs with the same fields."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
-    """Raise InputError if a settings dataclass has a number beyond MOST_SETTING or out of range, or a reversed pair.
+    """Raise InputError unless the numbers of a settings dataclass are within bounds, and its pairs are (lower, upper).
 
+    Bounds: ±MOST_SETTING.
     prefix: before field names in messages. skip: fields to leave unchecked. not_negative: fields that must be >= 0.
     """
     for name, value in vars(cfg).items():
@@ -31,7 +32,7 @@ def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative
 
 
 def filled(struct: Any, cfg: Any, skip: Collection[str] = (), degrees: Collection[str] = ()) -> Any:
-    """Copy the fields of a settings dataclass to a kernel struct, and return it; pairs (lower, upper) become vec2.
+    """Copy the fields of a settings dataclass to a kernel struct, pairs (lower, upper) as vec2; return the struct.
 
     skip: fields to omit; degrees: fields [deg] to convert to [rad].
     """

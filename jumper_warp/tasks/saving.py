@@ -79,7 +79,7 @@ def task_to_json(task: TaskCfg) -> dict[str, Any]:
 
 
 def handover_to_json(handover: Handover) -> dict[str, Any]:
-    """Return a handover of tasks as JSON data: names of its tasks and functions. Raises TaskError as `name_of`."""
+    """Return a handover between tasks as JSON data: names of tasks and functions. Raises TaskError: see `name_of`."""
     tasks = {"source": handover.source.name, "target": handover.target.name}
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
@@ -96,14 +96,14 @@ def shown(value: Any) -> str:
 
 @functools.cache
 def project_modules() -> frozenset[str]:
-    """Return the names of the project's modules that a saved task may name."""
+    """Return the names of the project's modules whose functions and types a saved task may use."""
     packages = (jumper_warp.kernels, jumper_warp.robot, jumper_warp.tasks)
     walks = (pkgutil.walk_packages(package.__path__, f"{package.__name__}.") for package in packages)
     return frozenset(module.name for walk in walks for module in walk)
 
 
 class Finder:
-    """Look-up of functions and types that a saved task names `module:name`, in the project's modules and the user's."""
+    """Look-up of functions and types that a saved task names (`module:name`), in modules of project and user."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
         """Set the modules to search: the project's, `modules` (the user's loaded ones), and their neighbours."""

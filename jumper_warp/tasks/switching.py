@@ -1,4 +1,4 @@
-"""Tasks of a robot with several skills (walking, jumps, turning in flight), and the handovers between them.
+"""Tasks of a robot with several skills (walking, jumping, turning in flight), and rules for switching between them.
 
 A jump starts as in its training: at rest on four paws near the default pose, which walking reaches when it is commanded
 to stand. The jump command is set at the handover, since the walking policy stands with less motion than a waiting jump
@@ -39,7 +39,7 @@ FALLS, FALLS_FROM_FLIGHT = (
 def for_switching(
     task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
 ) -> TaskCfg:
-    """Return a copy of a task for a robot that switches between skills: on level ground, ended by falls alone.
+    """Return a copy of a task for a robot that switches between skills, on level ground; only `falls` end its episodes.
 
     It has no rewards, critic, events and metrics. randomization: ranges for the robot, the same in all its skills.
     """
@@ -56,7 +56,7 @@ def for_switching(
 
 
 def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[Handover]]:
-    """Return the tasks [jump, turning] of a robot that turns in the flight of a jump, and the handovers there and back.
+    """Return the tasks [jump, turning] of a robot that turns in the flight of a jump, and handovers in both directions.
 
     Both have the jump's gravity and randomisation, and keep momentum in free flight.
     Raises InputError: `jump` is no jump task, or `turning` no attitude task.
@@ -80,7 +80,7 @@ def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[
 
 
 def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[list[TaskCfg], list[Handover]]:
-    """Return the tasks [walking, *jumps] of one robot, and two handovers per jump: walking to jump, jump to walking.
+    """Return the tasks [walking, *jumps] of one robot, and the rules (`Handover`) that switch to each jump and back.
 
     All have the randomisation of the last jump: walking was trained with wider ranges of everything but friction.
     Raises InputError: `walking` is no velocity task, or a jump no jump task.

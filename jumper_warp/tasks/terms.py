@@ -113,7 +113,7 @@ class Term(Copyable):
 
     @property
     def returned(self) -> str:
-        """Type that the term's function must return, in words."""
+        """Description, for messages, of the type that the term's function must return."""
         return self.returns[0].__name__ if self.returns else "any type"
 
     def check(self, state: Any) -> None:
@@ -222,7 +222,7 @@ class ObservationTerm(Term):
 
     @property
     def returned(self) -> str:
-        """Type that the term's function must return, in words."""
+        """Description, for messages, of the type that the term's function must return."""
         return "float or a vector"
 
     @property
@@ -269,7 +269,7 @@ class EventTerm(Term):
             raise InputError(f"EventTerm {self.name}: interval_range_s must be (lower, upper) above 0, got {interval}")
 
     def due_at(self, stage: int) -> bool:
-        """Return whether the event may run at a moment `stage`: STARTUP, AT_RESET, AT_STEP of `kernels.mdp.events`."""
+        """Return whether the event may run at a stage of `kernels.mdp.events`: STARTUP, AT_RESET or AT_STEP."""
         mode = MODES[self.options["mode"]]
         return stage == mode or (mode == AT_STEP and stage == AT_RESET)
 
@@ -286,12 +286,12 @@ class Advance(Term):
 
     @property
     def returned(self) -> str:
-        """Type that the term's function must return, in words."""
+        """Description, for messages, of the type that the term's function must return."""
         return "the state"
 
 
 class Curriculum(Term):
-    """Rule that raises a world's curriculum level when its episodes end with success and small errors.
+    """Rule that raises a world's curriculum level after several successful episodes in a row with small errors.
 
     Function: (robot: RobotView, state) -> float, error of an ended episode in `unit`. `promote_after` episodes in a row
     that end with success and an error up to `tolerance` raise the world's level. counts: @wp.func (state) -> bool,
@@ -312,7 +312,7 @@ class Curriculum(Term):
 
 @dataclass(frozen=True)
 class StateMetric:
-    """A metric of the training log, from a float field of all worlds' task states."""
+    """Metric of the training log that combines a float field of the task state over all worlds."""
 
     name: str  # Key in the log, with its unit; without a group, as in `Curriculum/level`, it becomes `Metrics/NAME`
     field: str  # Field of the task's state. With `per`, worlds accumulate in it, and logging sets both fields to 0.

@@ -15,7 +15,7 @@ from jumper_warp.rl.ppo import Ppo
 
 
 def make_ppo(env: VecEnv, cfg: PpoCfg) -> Ppo:
-    """Return the PPO trainer of an environment, with fused kernels if the device has them and `PpoCfg.fused` is set.
+    """Return the PPO trainer of an environment: `FusedPpo` if `use_fused` returns True, else `Ppo`.
 
     Raises InputError as `Ppo`.
     """
@@ -27,7 +27,7 @@ def make_ppo(env: VecEnv, cfg: PpoCfg) -> Ppo:
 
 
 def use_fused(cfg: PpoCfg, device: torch.device) -> bool:
-    """Return whether to train with the fused kernels; prints the reason if a GPU cannot use them.
+    """Return whether to train with the fused kernels; if GPU, settings or installation rule them out, print the reason.
 
     A CPU uses them only in tests, in Triton's interpreter (environment variable TRITON_INTERPRET=1).
     """

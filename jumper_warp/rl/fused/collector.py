@@ -1,4 +1,4 @@
-"""Rollout collection with the fused kernels: observations are stored normalised, as the inputs of both networks."""
+"""Rollout collection with the fused kernels, which stores observations as normalised inputs of actor and critic."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ObservationWriter:
         self._num_obs, self._samples = num_obs, num_steps * worlds
 
     def begin(self) -> None:
-        """Copy the running mean and standard deviation that normalise all observations of the next rollout."""
+        """Fix the normalisation for the next rollout: copy the running mean and standard deviation of observations."""
         for scaling, value in zip(self._scaling, self._running.scaling(), strict=True):
             scaling.copy_(value)
 
@@ -58,7 +58,7 @@ class ObservationWriter:
         )  # fmt: skip
 
     def moments(self) -> Moments:
-        """Return mean, variance and count of the observations in all steps of the rollout, float64."""
+        """Return mean, variance and count of the rollout's observations before normalisation, in float64."""
         sums = self._sums[:-1].sum((0, 1), dtype=torch.float64)[:, : self._num_obs] / self._samples
         return Moments(self._scaling.mean + sums[0], (sums[1] - sums[0].square()).clamp(min=0.0), self._samples)
 
@@ -104,7 +104,7 @@ class FusedCollector:
         self.critic_obs.write(self._critic_obs, self.rollout.critic_features[-1])
 
     def act(self, step: int) -> None:
-        """Sample actions for the current observations, and store observations and actions in the rollout."""
+        """Sample actions for the current observations, and store both as policy step `step` of the rollout."""
         rollout, fused, worlds = self.rollout, self._fused, self.env.num_envs
         self.obs.write(self.env.obs, rollout.features[step], step)
         self.critic_obs.write(self._critic_obs, rollout.critic_features[step], step)
@@ -115,7 +115,7 @@ class FusedCollector:
         )  # fmt: skip
 
     def record(self, step: int) -> None:
-        """Write the environment's last reward, end and final observation to the rollout, and count episodes."""
+        """Write an environment step's reward, done, timeout and final observation to the rollout; count episodes."""
         env, rollout, worlds = self.env, self.rollout, self.env.num_envs
         self.critic_obs.write(self._final_critic_obs, rollout.final_features[step])
         launch(kernels.record_step, (blocks(worlds, ROWS),))(

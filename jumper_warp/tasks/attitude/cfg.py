@@ -1,4 +1,4 @@
-"""Configuration of turning in free flight: starts of episodes and ranges of commanded turns."""
+"""Configuration of turning in free flight: states at the start of episodes, and ranges of commanded turns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jumper_warp.utils.errors import InputError
 
 @dataclass(frozen=True)
 class TurnCfg:
-    """Range of commanded turns that resets sample: one level of the curriculum."""
+    """Curriculum level of turning in flight: the range from which resets sample commanded turns."""
 
     angle: Pair
     """[deg] Angle of a commanded turn."""
@@ -33,7 +33,7 @@ class TurnCfg:
         check_probabilities("turn", self, "body_axis_probability")
 
     def values(self) -> Any:
-        """Return the range of sampled turns as a kernel struct, `TurnRanges`, angles in radians."""
+        """Return the range of commanded turns as a kernel struct, `TurnRanges`, with angles in radians."""
         return filled(TurnRanges(), self, degrees=("angle",))
 
 
@@ -66,7 +66,7 @@ class AttitudeResetCfg:
 
     @property
     def max_episode_length_s(self) -> float:
-        """Time limit of the longest episode [s]."""
+        """Largest time limit of an episode [s], the upper end of `episode`."""
         return self.episode[1]
 
     def values(self, step_dt: float) -> Any:

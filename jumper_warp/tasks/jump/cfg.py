@@ -127,7 +127,7 @@ class StartProbability:
 
 @dataclass(frozen=True)
 class ResetCfg:
-    """Start of jumps (reference state initialisation): start modes and ranges of their states; angles in degrees."""
+    """Ranges of the robot's state at the start of a jump episode (reference state initialisation); angles [deg]."""
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"

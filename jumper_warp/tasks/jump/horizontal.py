@@ -1,4 +1,4 @@
-"""Horizontal jump: one jump to a goal position in the plane, then standing there.
+"""Tasks of horizontal jumps: jump to a goal position in the plane, then stand there.
 
 Terms and constants are based on the paper and its authors' code. `docs/results/departures.csv` has all differences and
 their reasons; `paper.py` is the paper's own task.
@@ -96,7 +96,7 @@ def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_
 
 
 def level_all_around(ahead: float, aside: float, back: float) -> Level:
-    """Return a curriculum level with goals in an ellipse around the start.
+    """Return a curriculum level with goals in all directions, inside an ellipse around the start.
 
     Arguments: its half axes [m] ahead, to either side and back.
     """

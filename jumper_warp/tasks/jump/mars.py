@@ -1,4 +1,4 @@
-"""Jumps on Mars (3.71 m/s^2) as in the paper's sequel, without springs; transversal motors: 24.8 N m, kp 20 N m/rad.
+"""Tasks of jumps on Mars (3.71 m/s^2), without springs, as in a second paper of the authors (below: the sequel).
 
 The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose filter. Each filter
 has a task. Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to
@@ -26,7 +26,7 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return motors for jumps on Mars, transversal with 24.8 N m and kp 20 N m/rad; lateral_torque: limit [N m]."""
+    """Return motors for Mars: transversal with 24.8 N m and kp 20 N m/rad, lateral with lateral_torque [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 

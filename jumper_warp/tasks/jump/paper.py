@@ -1,4 +1,4 @@
-"""The paper's two jumps, as printed: observations, rewards, terminations, initialisation, curriculum and randomisation.
+"""Tasks of both jumps as printed in the paper: observations, rewards, terminations, starts, curriculum, randomisation.
 
 Sources of the constants are at the ends of the lines. P: the paper, with its table or section. A: the authors' public
 code. R: our reading, where the paper is silent or contradicts itself. Forms of rewards are those of Tables II and IV;

@@ -1,4 +1,4 @@
-"""Vertical jump: reach a commanded base height, then land.
+"""Task of a vertical jump: reach a commanded apex height of the base, then land.
 
 Terms and constants are based on the paper and its authors' code. `docs/results/departures.csv` has all differences and
 their reasons; `paper.py` is the paper's own task.
@@ -79,12 +79,12 @@ RESET = ResetCfg(
 
 
 def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
-    """Return curriculum levels: each range of commanded apex heights [m], with each range of start heights."""
+    """Return curriculum levels that combine each given range of apex heights [m] with each range of start heights."""
     return cross_levels([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
 
 
 def vertical_jump() -> TaskCfg:
-    """Return the task of a vertical jump with torque limits of 18 N m and, for lateral motors, the authors' 10 N m."""
+    """Return the task of a vertical jump with torque limits of 18 N m (lateral motors: 10 N m, as the authors')."""
     return TaskCfg(
         name="vertical-jump",
         state=JumpState,

@@ -1,4 +1,4 @@
-"""Configuration of velocity tracking: starts of episodes, ranges of commands and the terrain map."""
+"""Configuration of velocity tracking: states at the start of episodes, ranges of commands, and the terrain map."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Reach = tuple[float, float, float, float]  # largest speeds: ahead, back, sidewa
 
 @dataclass(frozen=True)
 class CommandCfg:
-    """Ranges of sampled velocity commands: (ahead, back, to either side [m/s], turning to either side [rad/s])."""
+    """Ranges of sampled velocity commands, given as largest speeds (ahead, back, sideways [m/s], turning [rad/s])."""
 
     first_range: Reach = (0.8, 0.8, 0.8, 0.8)
     """Command range at the first curriculum level: largest speeds ahead, back, sideways [m/s] and turning [rad/s]."""
@@ -64,7 +64,7 @@ class CommandCfg:
             raise InputError(f"resampling_time_range must be (lower, upper), positive and finite, got ({low}, {high})")
 
     def values(self) -> Any:
-        """Return the ranges of commands as a kernel struct, `CommandRanges`, times in policy steps of 1/60 s."""
+        """Return the ranges of commands as a kernel struct, `CommandRanges`, with times in policy steps of 1/60 s."""
         ranges = filled(CommandRanges(), self, skip=("first_range", "last_range", "levels", "resampling_time_range"))
         ranges.first_range, ranges.last_range = wp.vec4(*self.first_range), wp.vec4(*self.last_range)
         ranges.levels = self.levels

@@ -97,7 +97,7 @@ METRICS = (
 
 
 def velocity_flat() -> TaskCfg:
-    """Return the task of velocity tracking on a plane, with gains and 10 N m torque limit of the authors' code."""
+    """Return the task of velocity tracking on a plane, with gains and torque limit (10 N m) of the authors' code."""
     return TaskCfg(
         name="velocity-flat",
         state=VelocityState,

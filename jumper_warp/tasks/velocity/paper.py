@@ -1,4 +1,4 @@
-"""The paper's walking policy, as printed: observation, rewards, terminations, starts and randomisation.
+"""Task of walking as printed in the paper: observation, rewards, terminations, start states and randomisation.
 
 Sources of the constants are at the ends of the lines. P: the paper, with its table or section. A: the authors' public
 code. R: our reading, where the paper is silent or contradicts itself. Forms of rewards are those of Tables II and III;

@@ -1,4 +1,4 @@
-"""Triton kernels of the fused update, in the order of an iteration.
+"""Triton kernels of PPO's rollout and update, listed in the order in which an iteration runs them.
 
 `rollout` acts and records, `layers` evaluates the networks, `losses` computes the losses and the gradients of the
 outputs, `layers` those of inputs and weights, and `optimiser` sums them and runs Adam.

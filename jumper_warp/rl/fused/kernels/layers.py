@@ -42,9 +42,10 @@ def layer_forward(
 def layer_backward(
     grad_out, weight, y, grad_in, rows, num_in, num_out, BM: tl.constexpr, BN: tl.constexpr, BK: tl.constexpr
 ):
-    """Backpropagate a gradient through a layer and the ELU before it; write (grad_out W) elu', (rows, num_in).
+    """Backpropagate a gradient through a linear layer and the ELU before it; write it to grad_in (rows, num_in).
 
-    grad_out: (rows, num_out); weight: (num_out, num_in); y: (rows, num_in) the input, elu' = 1 + min(y, 0).
+    The result is (grad_out W) elu' with elu' = 1 + min(y, 0). grad_out: (rows, num_out); weight: (num_out, num_in); y:
+    (rows, num_in) the layer's input.
     """
     row = tl.program_id(0) * BM + tl.arange(0, BM)
     col = tl.program_id(1) * BN + tl.arange(0, BN)
@@ -66,7 +67,7 @@ def network_forward(
     x, index, weights, value, outputs, rows, LAYERS: tl.constexpr, BIASES: tl.constexpr, PADDED: tl.constexpr,
     GATHER: tl.constexpr, BM: tl.constexpr, BK: tl.constexpr,
 ):  # fmt: skip
-    """Evaluate a network; write the outputs of all its layers with GATHER, else only those of the last layer.
+    """Evaluate a network; write the output of its last layer or, with GATHER, the outputs of all its layers.
 
     A block keeps its rows.
     x, index, GATHER: as in `layer_forward`; value: flat vector of the parameters; outputs: of each layer. LAYERS: the
@@ -113,7 +114,7 @@ def network_forward(
 
 @triton.jit
 def network_backward(grad_outs, weights, outputs, rows, LAYERS: tl.constexpr, PADDED: tl.constexpr, BM: tl.constexpr):
-    """Backpropagate through a network: write the gradients with respect to its hidden layers, before their ELU.
+    """Backpropagate through a network: write the gradients with respect to the pre-activations of its hidden layers.
 
     As in `network_forward`, but all sequences have the last layer first. grad_outs: of each layer, (rows, num_out), of
     which that of the last layer is given.
@@ -134,7 +135,7 @@ def input_gradient(
     grad, weight, y, grad_in, row, rows, NUM_IN: tl.constexpr, NUM_OUT: tl.constexpr, BK: tl.constexpr,
     BN: tl.constexpr,
 ):  # fmt: skip
-    """Backpropagate `grad` (len(row), BK) to a layer's input before its ELU; write and return it for the rows `row`."""
+    """Backpropagate `grad` (len(row), BK) through a layer and the ELU before it, to `grad_in`; return the result."""
     k, col = tl.arange(0, BK), tl.arange(0, BN)
     place = weight + k[:, None] * NUM_IN + col[None, :]
     acc = tl.dot(grad, tl.load(place, mask=(k < NUM_OUT)[:, None] & (col < NUM_IN)[None, :], other=0.0))
@@ -151,7 +152,7 @@ def weight_gradients(
     grad_outs, inputs, index, partial, stride, rows, rows_per_split, LAYERS: tl.constexpr, TILES: tl.constexpr,
     BK: tl.constexpr,
 ):  # fmt: skip
-    """Write weight gradients, grad_outᵀ x, and bias gradients, Σ grad_out, of all layers, for each part of the samples.
+    """Write the gradients of all layers' weights (grad_outᵀ x) and biases (Σ grad_out), one sum per split of samples.
 
     grad_outs, inputs: gradient with respect to a layer's output and its input x, (…, num_out) and (…, num_in); the
     first x has `rows` rows, of which the rows `index` are taken. partial: (SPLITS, stride), in the places of LAYERS.

@@ -8,10 +8,10 @@ from jumper_warp.rl.fused.kernels.scalar import HALF_LOG_TAU
 
 @triton.jit
 def policy_mean(output, mirror, row, action, mask, width, MIRROR: tl.constexpr):
-    """Return the policy's mean action and left-right asymmetry, (len(row), len(action)) each, from network outputs.
+    """Return the policy's mean action and its deviation from mirror symmetry, (len(row), len(action)) each.
 
-    Asymmetry: f(x) - N f(M x). MIRROR: rows 2 i and 2 i + 1 of `output` are f(x) and f(M x) of row i. mirror: (2,
-    width) order and signs of N.
+    Deviation: f(x) - N f(M x). output: of the network; with MIRROR, rows 2 i and 2 i + 1 are f(x) and f(M x) of row i.
+    mirror: (2, width) order and signs of N.
     """
     if MIRROR:
         order = tl.load(mirror + action).to(tl.int32)

@@ -35,7 +35,7 @@ def prepare_step(
     gradient, squares, lr, num_steps, factors, desired_kl, size, actor_size, min_lr, max_lr, ADAPT: tl.constexpr,
     B: tl.constexpr,
 ):  # fmt: skip
-    """Adapt the learning rate for a step of Adam, and write the gradient's sum of squares in each block of entries.
+    """Prepare a step of Adam: adapt the learning rate, and write the gradient's sum of squares per block of entries.
 
     squares: (blocks, 2), of actor and critic.
     gradient: (size + 32,), the last entry is the KL divergence. lr, num_steps: () of `FlatAdam`; the rate adapts as in

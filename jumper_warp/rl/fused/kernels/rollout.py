@@ -1,4 +1,4 @@
-"""Triton kernels of a rollout's policy step: normalised observations, sampled actions, recorded results."""
+"""Triton kernels of a policy step in a rollout: normalise observations, sample actions, record results."""
 
 import triton
 import triton.language as tl
@@ -38,9 +38,10 @@ def sample_action(
     output, mirror, log_std, action, samples, rows, num_actions, sample_width, MIRROR: tl.constexpr,
     WIDTH: tl.constexpr, BM: tl.constexpr,
 ):  # fmt: skip
-    """Sample actions; write them to `action`, and with mean and log probability to `samples` (rows, sample_width).
+    """Sample actions and write them to `action`; write actions, their means and log probabilities to `samples`.
 
-    output, mirror: as in `policy_mean`; action: (rows, num_actions), standard normal noise on entry.
+    output, mirror: as in `policy_mean`; action: (rows, num_actions), standard normal noise on entry; samples: (rows,
+    sample_width).
     """
     row, col = tl.program_id(0) * BM + tl.arange(0, BM), tl.arange(0, WIDTH)
     mask = (row < rows)[:, None] & (col < num_actions)[None, :]
@@ -61,7 +62,7 @@ def sample_action(
 def record_step(
     reward, done, timeout, rewards, dones, timeouts, episode, finished, rows, scale, B: tl.constexpr
 ):  # fmt: skip
-    """Write a step's reward, done and timeout, (rows,) each, to the rollout; update returns and lengths of episodes.
+    """Write a step's reward, done and timeout, (rows,) each, to the rollout; update the episodes' returns and lengths.
 
     episode: (2, rows) and finished: (3, rows), float64, as in `Collector`.
     """
