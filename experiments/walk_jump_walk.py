@@ -62,7 +62,7 @@ def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
 
 
 def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
-    """Return the script of the paper's test with random walking velocities."""
+    """Return the sequence of commands of the paper's test: random walks, a jump up, walks, a jump ahead, walks."""
     up, ahead = ScriptStep("jump_up", (HEIGHT,)), ScriptStep("jump_to", (DISTANCE, 0.0))
     before, between, after = (random_walks(rng, count) for count in WALKS)
     return [*before, up, *between, ahead, *after]

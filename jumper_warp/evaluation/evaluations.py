@@ -38,7 +38,7 @@ class EvaluationFlags(Protocol):
 
 
 class PlayFlags(Protocol):
-    """Interface of a frozen dataclass with the flags of `jumper play` for some tasks, such as jumps to heights."""
+    """Interface of dataclasses with the flags of `jumper play` for a kind of task, such as jumps or walks."""
 
     @property
     def length(self) -> float:

@@ -23,7 +23,7 @@ COMPARABLE = 10.0
 
 @dataclass(frozen=True)
 class FitTest:
-    """Result of a one-sided χ² test of a motion: of its residuals, or of one sensor's agreement with all others."""
+    """Result of a χ² test of whether noise explains a motion's residuals, or how one sensor differs from the others."""
 
     motion: str
     channel: str  # empty: all channels of the motion; "parameters by ...": of a sensor, compared with all others

@@ -234,7 +234,10 @@ def check_motors(description: RobotDescription) -> None:
 
 
 def check_poses(description: RobotDescription) -> None:
-    """Raise RobotDescriptionError for poses outside the stops or with open loops, or without a pose named default."""
+    """Check that poses are within the joint stops and close all loops, and that one is named default.
+
+    Raises RobotDescriptionError.
+    """
     file, leg = description.path, leg_dimensions(description, "FL")
     require("default" in description.poses, file, "poses", "expected a pose named default")
     for name, (lateral, transversal) in description.poses.items():

@@ -39,7 +39,9 @@ class Layer(NamedTuple):
 
 
 class FusedLayout:
-    """Offsets of all parameters in the kernels' zero-padded vector of parameters, and in the sums of their gradients.
+    """Offsets of all parameters in the zero-padded vector of parameters that the fused kernels read.
+
+    Partial sums of the gradients have the same offsets.
 
     `table` (3, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in the
     padded vector, the place of its mirror image, and the image's sign; 0 is a place that nothing uses.

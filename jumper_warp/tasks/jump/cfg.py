@@ -60,7 +60,7 @@ class GroundCfg:
         return self.platform + self.block > 0.0
 
     def ranges(self) -> Any:
-        """Return the ranges of platforms and blocks as a kernel struct, `GroundRanges`."""
+        """Return the settings of sampled platforms and blocks as a kernel struct, `GroundRanges`."""
         return filled(GroundRanges(), self)
 
 

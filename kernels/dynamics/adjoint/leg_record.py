@@ -242,7 +242,7 @@ def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
 
 @wp.func
 def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
-    """Write a paw's contact law to the record; for a paw without contact (mode SEPARATE), only `mode`."""
+    """Write a paw's contact (impulse and derivatives) to the reverse pass' record; without contact, only its mode."""
     record.legs[entry, MODE, world, leg] = real(law.mode)
     if law.mode != SEPARATE:
         record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)
