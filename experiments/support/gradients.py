@@ -1,4 +1,4 @@
-"""Gradients of a jump's apex, by the reverse pass and by central differences.
+"""Gradients of a jump's apex w.r.t. targets, start and parameters, by reverse pass and by central differences.
 
 The jump starts in a squat on the ground and is simulated with filter, motors, dynamics and contact, at the solver's
 default step.
