@@ -148,13 +148,13 @@ def parse(
     task_module = Flag(
         "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
     )
-    flags = list_flags(kind if default is None else default, described=wants_help(args))
-    flags += [task_module] if program is None else []
+    fields = kind if default is None else default
+    flags = list_flags(fields, described=wants_help(args)) + ([task_module] if program is None else [])
     program = program or f"jumper {command}"
     if wants_help(args):
         print(help_page(program, description or inspect.getdoc(kind) or "", flags, args, short), end="")
         raise SystemExit(0)
-    args = use_new_names(args, kind if default is None else default)
+    args = use_new_names(args, fields)
     options = {option for flag in flags for option in flag.options}
     for option in filter(None, map(option_of, args)):
         if option not in options:
@@ -168,7 +168,7 @@ def parse(
         with contextlib.redirect_stderr(printed):
             parsed = tyro.cli(kind, args=args, **settings)
     except SystemExit:
-        raise UsageError(parse_error(printed.getvalue(), flags, args)) from None
+        raise UsageError(parse_error(printed.getvalue(), list_flags(fields), args)) from None
     print(printed.getvalue(), end="", file=sys.stderr)
     check_numbers(parsed)
     return parsed
