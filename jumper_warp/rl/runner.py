@@ -366,13 +366,13 @@ class TrainingRun:
 
     def _add_score(self) -> None:
         """Add the logged `best_metric` to the scores once half of the worlds have reached the last curriculum level."""
-        levels, score = level_fractions(self.metrics), self.metrics.get(self.cfg.best_metric)
+        levels, score = level_fractions(self.metrics), self.metrics.get(self.cfg.best_metric, math.nan)
         at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
-        if score is not None and (not levels or at_end >= 0.5):
+        if math.isfinite(score) and (not levels or at_end >= 0.5):
             self._scores.append(score)
 
     def _score(self) -> float | None:
-        """Return the mean score since the last checkpoint, by which the best one is chosen; None without a score."""
+        """Remove the scores since the last checkpoint and return their mean, which selects the best; None without."""
         scores, self._scores = self._scores, []
         return sum(scores) / len(scores) if scores else None
 

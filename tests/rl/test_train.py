@@ -381,8 +381,18 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
 def test_checkpoint_has_the_mean_score_once_half_of_the_worlds_are_at_the_last_level(fractions, score):
     levels = {f"Curriculum/fraction_at_level_{i}": fraction for i, fraction in enumerate(fractions)}
     run = SimpleNamespace(cfg=TrainCfg(task="t"), _scores=[])
-    for success in (0.9, 0.7):
+    for success in (0.9, math.nan, 0.7):
         run.metrics = {"Metrics/success": success, **levels}
         TrainingRun._add_score(run)
     assert TrainingRun._score(run) == (score and pytest.approx(score))
     assert TrainingRun._score(run) is None  # no value since the checkpoint before
+
+
+def test_saved_score_is_the_mean_of_the_logged_metric_since_the_checkpoint_before(tmp_path):
+    train(push_cfg(tmp_path, log_interval=1, best_metric="Loss/value"), PushTask)
+    (folder,) = tmp_path.glob("push/*")
+    logged = [json.loads(line)["Loss/value"] for line in (folder / METRICS_FILE).read_text().splitlines()]
+    manifest = json.loads((folder / CHECKPOINTS / MANIFEST).read_text())
+    means = [(logged[0] + logged[1]) / 2.0, (logged[2] + logged[3]) / 2.0]
+    assert [entry["score"] for entry in manifest.values()] == pytest.approx(means)
+    assert means[0] != pytest.approx(logged[1])
