@@ -39,6 +39,7 @@ def loading_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) ->
     The block must launch none of them. At its end this thread compiles too, until all are loaded. kernels: pairs of a
     kernel and its launch's threads per block (ignored on a CPU). Compiler errors propagate.
     """
+    _ = device.context  # Warp creates a device's context and streams at the first use, which is not thread-safe
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
     remaining = iter(list(variants))
 
