@@ -87,6 +87,5 @@ def report(
     done: what was done, the first line; keys: of the metrics in the summary, missing ones are skipped; paper: published
     values by key.
     """
-    write_metrics(folder, values)
-    print_summary(folder, done, keys, paper=paper, flags=args, seconds=process_age())
+    print_summary(write_metrics(folder, values), done, keys, paper=paper, flags=args, seconds=process_age())
     return values

@@ -21,7 +21,7 @@ from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue
-from jumper_warp.utils.output import write_metrics
+from jumper_warp.utils.output import Report, write_metrics
 from jumper_warp.utils.summary import PrintFlags
 
 if TYPE_CHECKING:
@@ -162,10 +162,10 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):
         warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})
-    write_metrics(run.folder, columns)
+    report = write_metrics(run.folder, columns)
     count = len(next(iter(columns.values())))
     words = f"{count} {log.row_name}{'s' * (count > 1)}"
-    return show_recording(run, recorder.recording(), log.row_name, cfg, words, log.main_columns or columns)
+    return show_recording(run, report, recorder.recording(), log.row_name, cfg, words, log.main_columns or columns)
 
 
 def played_name(source: str | Path) -> str:
@@ -209,28 +209,28 @@ def play_script(cfg: ScriptCfg) -> Path:
     run_evaluation(run.actor(env), env, course, on_step=recorder)
     plot_course(run.folder / "timeline.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
-    write_metrics(run.folder, metrics, run.condition_values)
+    report = run.write(metrics)
     defined = [
         key for key in SCRIPT_SUMMARY if not isinstance(metrics[key], MetricValue) or metrics[key].value is not None
     ]
     words = f"{len(script)} command{'s' * (len(script) > 1)} of {cfg.script}"
-    return show_recording(run, recorder.recording(), "course", cfg, words, defined)
+    return show_recording(run, report, recorder.recording(), "course", cfg, words, defined)
 
 
 def show_recording(
-    run: Run, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
+    run: Run, report: Report, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
 ) -> Path:  # fmt: skip
     """Write a recording (.rrd, picture, film if requested), print a summary, and return the path of the .rrd file.
 
-    It opens the viewer that `cfg` names. name: of the files and of a trial; count, keys: number of trials and main
-    metrics, for the summary.
+    It opens the viewer that `cfg` names. report: written metrics of the run. name: of the files and of a trial; count,
+    keys: number of trials and main metrics, for the summary.
     """
     from jumper_warp.evaluation.recorder import save_recording
 
     path = save_recording(recording, run.folder, name, cfg.film.eye)
     films = [] if cfg.film.video is None else [cfg.film.write(recording)]
     run.print_flags = cfg.printing
-    run.summarise(count, keys, trial=name, films=films)
+    run.summarise(report, count, keys, trial=name, films=films)
     open_viewer(path, cfg.viewer)
     return path
 

@@ -29,7 +29,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import range_words
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
-from jumper_warp.utils.output import output_dir, read_values, write_metrics
+from jumper_warp.utils.output import Report, output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.summary import PrintFlags, print_summary
 from jumper_warp.utils.threads import checked_threads
@@ -193,32 +193,31 @@ class Run(ABC):
             save_recording(recorder.recording(), self.folder, film)
         return log
 
-    def write(self, metrics: AnyMetrics) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, and return all values by name."""
-        write_metrics(self.folder, metrics, self.condition_values)
-        return read_values(self.folder)
+    def write(self, metrics: AnyMetrics) -> Report:
+        """Write conditions and metrics to `metrics.json`, and return both."""
+        return write_metrics(self.folder, metrics, self.condition_values)
 
-    def summarise(self, count: str, keys: Iterable[str], **settings: Any) -> None:
-        """Print a summary of `metrics.json`; count: number and kind of trials; settings: see `print_summary`."""
+    def summarise(self, report: Report, count: str, keys: Iterable[str], **settings: Any) -> None:
+        """Print a summary of a report; count: number and kind of trials; settings: see `print_summary`."""
         name, count = self.name.replace("_", " "), f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
         what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
-        print_summary(self.folder, what, keys, flags=self.print_flags, seconds=seconds, **settings)
+        print_summary(report, what, keys, flags=self.print_flags, seconds=seconds, **settings)
 
     def report(
         self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
     ) -> dict[str, Any]:  # fmt: skip
         """Write all metrics to `metrics.json`, print those with the given keys, and return all values by name."""
-        values = self.write(metrics)
+        written = self.write(metrics)
         ends = [key for key in metrics if key.startswith("ended_by_")]
         ends = sorted(ends, key=lambda key: metrics[key].value or 0.0, reverse=True)[:MOST_ENDS]  # pyright: ignore
         keys = [key for name in keys for key in (ends if name == "ended_by_" else [name])]
         printed = [metrics[key] for key in keys if key in metrics]
         most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
         over = most.over.removesuffix("s") if most.over and most.trials == 1 else most.over
-        self.summarise(f"{most.trials:,} {over}" if most.trials else "", keys, paper=paper)
-        return values
+        self.summarise(written, f"{most.trials:,} {over}" if most.trials else "", keys, paper=paper)
+        return written.values
 
 
 class EvaluationRun(Run):

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,28 @@ from jumper_warp.utils.metrics import AnyMetrics, MetricValue, Scalar, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
 VERSION = 1  # Version of the layout of metrics.json
+
+
+class Report(NamedTuple):
+    """Metrics of a run with the conditions in which they were measured, and the file that holds both."""
+
+    path: Path  # of metrics.json
+    conditions: dict[str, Any]  # conditions of the evaluation by name
+    metrics: dict[str, MetricValue]  # values are Python numbers, strings, None, or lists of these
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Conditions, and values of the metrics without intervals, by name."""
+        return self.conditions | {key: metric.value for key, metric in self.metrics.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        entries = {
+            key: {"value": metric.value, "unit": unit_of(key)} | metric._asdict()
+            for key, metric in self.metrics.items()
+        }
+        header = {"schema": "jumper-warp metrics", "version": VERSION, "conditions": self.conditions}
+        return header | {"metrics": entries}
 
 
 def output_dir(name: str, out: Path | None = None) -> Path:
@@ -39,45 +61,42 @@ def output_dir(name: str, out: Path | None = None) -> Path:
     return folder
 
 
-def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, Any] | None = None) -> Path:
-    """Write the metrics of a run and its commit, versions and command, as `metrics.json` and `run.json`.
+def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, Any] | None = None) -> Report:
+    """Write the metrics of a run and its commit, versions and command, as `metrics.json` and `run.json`; return both.
 
-    Returns the path of metrics.json. Each file is written atomically. Environment variables are not saved. NumPy
+    Each file is written atomically. Environment variables are not saved. NumPy
     scalars become Python numbers. folder: an existing folder; conditions: conditions of the evaluation by name. Raises
     InputError: a value is not finite. TypeError: a value has another type. Both name the metric.
     """
-    entries = {key: _entry(key, value) for key, value in metrics.items()}
-    document = {
-        "schema": "jumper-warp metrics",
-        "version": VERSION,
-        "conditions": {name: _to_python(name, value) for name, value in (conditions or {}).items()},
-        "metrics": entries,
-    }
+    known = {name: _to_python(name, value) for name, value in (conditions or {}).items()}
+    converted = {key: _converted(key, value) for key, value in metrics.items()}
+    report = Report(folder / "metrics.json", known, converted)
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     run = source_versions() | {"device": device_info()._asdict(), "command": command}
-    for name, content in (("run.json", run), ("metrics.json", document)):
+    for name, content in (("run.json", run), ("metrics.json", report.to_json())):
         write_atomically(folder / name, json_bytes(content))
-    return folder / "metrics.json"
+    return report
 
 
-def read_metrics(folder: Path) -> dict[str, MetricValue]:
-    """Read the metrics in a run's `metrics.json`, by key."""
-    entries = json.loads((folder / "metrics.json").read_text())["metrics"]
-    return {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries.items()}
+def read_report(folder: Path) -> Report:
+    """Read the metrics and conditions of a run from its `metrics.json`."""
+    path = folder / "metrics.json"
+    document = json.loads(path.read_text())
+    entries = document["metrics"].items()
+    metrics = {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries}
+    return Report(path, document["conditions"], metrics)
 
 
 def read_values(folder: Path) -> dict[str, Any]:
     """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
-    conditions = json.loads((folder / "metrics.json").read_text())["conditions"]
-    return conditions | {key: metric.value for key, metric in read_metrics(folder).items()}
+    return read_report(folder).values
 
 
-def _entry(key: str, value: Any) -> dict[str, Any]:
-    """Convert a metric to its JSON object in metrics.json. Raises TypeError or InputError as `write_metrics`."""
+def _converted(key: str, value: Any) -> MetricValue:
+    """Return a metric with Python numbers and lists. Raises TypeError or InputError as `write_metrics`."""
     metric = value if isinstance(value, MetricValue) else MetricValue(value)
-    number = _to_python(key, metric.value)
-    interval = None if metric.interval is None else _to_python(key, list(metric.interval))
-    return {"value": number, "unit": unit_of(key), "trials": metric.trials, "interval": interval, "over": metric.over}
+    interval: Any = None if metric.interval is None else _to_python(key, list(metric.interval))
+    return metric._replace(value=_to_python(key, metric.value), interval=interval)
 
 
 def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:

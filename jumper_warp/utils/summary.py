@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,8 +12,9 @@ from typing import Any
 import tyro
 from rich.table import Column, Table
 
+from jumper_warp.utils.files import json_bytes
 from jumper_warp.utils.metrics import MetricValue, format_value, print_metrics, split_unit
-from jumper_warp.utils.output import read_metrics
+from jumper_warp.utils.output import Report
 from jumper_warp.utils.tables import WIDTH, print_table
 
 KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
@@ -34,31 +34,31 @@ class PrintFlags:
 
 
 def print_summary(
-    folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
+    report: Report, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
     flags: PrintFlags | None = None, trial: str = "trial", films: Iterable[Path] = (),
 ) -> None:  # fmt: skip
     """Print a summary of a run: title, main metrics (by `keys`) and paths of its files, 80 columns wide.
 
-    title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
+    title: what was done; keys: of the main metrics, those that the report lacks are skipped; seconds: wall time of the
     run; paper: published values by key; flags: print all metrics, or the file itself; trial: noun for the items of
     metrics that are lists; films: films of the run, in any folder.
     """
-    flags, paper, path = flags or PrintFlags(), paper or {}, folder / "metrics.json"
+    flags, paper = flags or PrintFlags(), paper or {}
     if flags.json:
-        print(path.read_text(), end="")
+        print(json_bytes(report.to_json()).decode(), end="")
         return
-    metrics = read_metrics(folder)
+    metrics, folder = report.metrics, report.path.parent
     main = {key: metrics[key] for key in keys if key in metrics}
     print(textwrap.fill(title, WIDTH))
     if flags.verbose:
-        print_metrics(metrics, paper, json.loads(path.read_text())["conditions"])
+        print_metrics(metrics, paper, report.conditions)
     elif main:
         table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
         print_table(table)
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
     hints += [f"--verbose prints {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
     end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
-    print(*_file_lines(folder, list(films)), f"{'metrics':9}  {path}", end, sep="\n")
+    print(*_file_lines(folder, list(films)), f"{'metrics':9}  {report.path}", end, sep="\n")
 
 
 def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:

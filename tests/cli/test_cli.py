@@ -612,9 +612,10 @@ def test_summary_on_a_closed_output_pipe_exits_with_0(tmp_path, flags):
     write_metrics(tmp_path, {"apex_m": 1.0})
     lines = [
         "from pathlib import Path", "from jumper_warp.cli.main import run_command",
+        "from jumper_warp.utils.output import read_report",
         "from jumper_warp.utils.summary import PrintFlags, print_summary",
-        f"flags = PrintFlags(**{flags}); folder = Path({str(tmp_path)!r})",
-        "run_command(lambda: print_summary(folder, 'a jump', ['apex_m'], seconds=1.0, flags=flags))",
+        f"flags = PrintFlags(**{flags}); report = read_report(Path({str(tmp_path)!r}))",
+        "run_command(lambda: print_summary(report, 'a jump', ['apex_m'], seconds=1.0, flags=flags))",
     ]  # fmt: skip
     assert_quiet_on_closed_pipe("\n".join(lines))
 

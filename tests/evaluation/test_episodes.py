@@ -8,7 +8,7 @@ from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePla
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
-from jumper_warp.utils.output import read_metrics, read_values
+from jumper_warp.utils.output import read_report, read_values
 from landing_helpers import still_policy
 from metric_helpers import values
 
@@ -133,7 +133,7 @@ def goals_of(policy, folder, *flags):
                   "--out", str(folder)], [])  # fmt: skip
     trials = np.load(folder / "trials.npz")
     goals = [trials[name] for name in ("start_goal_0", "start_goal_1") if name in trials]
-    return read_metrics(folder), np.stack(goals, axis=1) if goals else None
+    return read_report(folder).metrics, np.stack(goals, axis=1) if goals else None
 
 
 def test_commands_are_drawn(policy, tmp_path):

@@ -18,7 +18,7 @@ from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue, mean, rate
-from jumper_warp.utils.output import read_metrics
+from jumper_warp.utils.output import read_report
 from support import policy_results, policy_tests
 from support.policy_choice import NEEDS
 from support.policy_comparisons import means_p, proportions_p, seed_section, seed_tests
@@ -192,7 +192,7 @@ def test_rows_have_the_metrics_of_jumper_evaluate(measured, tmp_path):
     flags = ["--num-jumps", "16", "--randomize", "--noise", "--push-in-flight", "--device", "cpu"]
     assert jumper(["evaluate", "vertical_jump", *flags, "--out", str(tmp_path)]) in (0, None)
     row_folder = measured[0].out / "vertical_jump/push_in_flight-0"
-    assert read_metrics(row_folder) == read_metrics(tmp_path)
+    assert read_report(row_folder).metrics == read_report(tmp_path).metrics
 
 
 def test_policies_get_new_rows_and_keep_their_other_rows_and_earlier_metrics(measured, tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ def test_refuses_a_name_that_is_not_one_path_component(name):
 
 def test_metrics_file_holds_the_given_metrics(tmp_path):
     metrics = {"apex [m]": 1.075, "worlds": 4096, "method": "open loop", "passed": True, "gap": None, "list": [18.0, 1]}
-    path = output.write_metrics(tmp_path, metrics)
+    path = output.write_metrics(tmp_path, metrics).path
     assert path == tmp_path / "metrics.json"
     assert output.read_values(tmp_path) == metrics
 
@@ -58,12 +58,22 @@ def test_metrics_file_has_documented_layout(tmp_path):
 
 
 def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
-    path = output.write_metrics(tmp_path, {"drift_m": MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
-    assert json.loads(path.read_text()) == {
+    report = output.write_metrics(tmp_path, {"drift_m": MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
+    assert json.loads(report.path.read_text()) == {
         "schema": "jumper-warp metrics", "version": 1, "conditions": {"a": 1},
         "metrics": {"drift_m": {"value": 0.5, "unit": "m", "trials": 4, "interval": [0.1, 0.9], "over": "jumps"}},
     }  # fmt: skip
-    assert output.read_metrics(tmp_path) == {"drift_m": MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
+    assert report.metrics == {"drift_m": MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
+
+
+def test_a_report_in_memory_is_the_one_in_the_file(tmp_path):
+    metrics = {
+        "drift_m": MetricValue(np.float32(0.1), 4, (0.1, np.float64(0.9)), "jumps"),
+        "bin_m": [np.int64(1), None],
+    }
+    report = output.write_metrics(tmp_path, metrics, {"seed": np.int32(3)})
+    assert output.read_report(tmp_path) == report
+    assert report.values == {"seed": 3, "drift_m": float(np.float32(0.1)), "bin_m": [1, None]}
 
 
 @pytest.mark.parametrize(

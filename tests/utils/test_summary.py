@@ -24,10 +24,10 @@ def summary(tmp_path, capsys):
 
     # keys: metrics to print; files: empty files in the folder; flags: of `PrintFlags`
     def run(keys=tuple(METRICS)[:5], files=("a.png", "film.mp4", "jump.rrd", "notes.txt"), **flags):
-        write_metrics(tmp_path, METRICS, {"solver": "jumper"})
+        report = write_metrics(tmp_path, METRICS, {"solver": "jumper"})
         for name in files:
             (tmp_path / name).touch()
-        print_summary(tmp_path, "200 jumps", keys, paper=PAPER, flags=PrintFlags(**flags), seconds=12.3)
+        print_summary(report, "200 jumps", keys, paper=PAPER, flags=PrintFlags(**flags), seconds=12.3)
         return capsys.readouterr().out, tmp_path
 
     return run
@@ -51,8 +51,7 @@ def test_summary_names_ranges_and_ends_in_words(tmp_path, capsys):
         "ended_by_no_end_rate": MetricValue(0.9, 2, None, "episodes"),
         "end": "no_end",
     }
-    write_metrics(tmp_path, keys)
-    print_summary(tmp_path, "2 jumps", keys, seconds=1.0)
+    print_summary(write_metrics(tmp_path, keys), "2 jumps", keys, seconds=1.0)
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[2:7] == [
         "success rate, trained 0.4 to 1.1 m 50 %",
@@ -82,9 +81,9 @@ def test_summary_counts_files_of_a_kind_if_there_are_many(summary):
 
 
 def test_summary_of_lists_has_a_column_for_each_trial(tmp_path, capsys):
-    write_metrics(tmp_path, {"apex_m": [0.5, None], "outcome": ["success", "tilted"]})
+    report = write_metrics(tmp_path, {"apex_m": [0.5, None], "outcome": ["success", "tilted"]})
     film = tmp_path / "films" / "jump.webp"
-    print_summary(tmp_path, "2 jumps", ["apex_m", "outcome"], seconds=1.0, trial="jump", films=[film])
+    print_summary(report, "2 jumps", ["apex_m", "outcome"], seconds=1.0, trial="jump", films=[film])
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[1:4] == ["jump 1 jump 2".split(), "apex 0.5 m undefined".split(), "outcome success tilted".split()]
     assert ["film", str(film)] in lines and not any("picture" in line for line in lines)
