@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -19,7 +19,7 @@ from jumper_warp.cli.help import wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
-from jumper_warp.rl.cfg import UNUSED, TrainCfg
+from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
 from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
 from jumper_warp.utils.threads import checked_threads
 
@@ -138,7 +138,9 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
 
 def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
     """Return the flags in unparsed arguments that a trainer does not use."""
-    names = [name.replace("_", "-") for name in UNUSED.get(trainer, ())]
+    if trainer != "rsl-rl":
+        return []
+    names = [name.replace("_", "-") for name in RSL_RL_UNUSED]
     flags = list_flags(TrainArgs, described=False)
     unused = {option for flag in flags if flag.name in names for option in flag.options}
     return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
@@ -190,15 +192,10 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     from jumper_warp.envs.env import Env
 
     def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
-        """Return the training's environment, differentiable for trainer shac."""
+        """Return the training's environment."""
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
-        env = Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
-        if args.cfg.trainer != "shac":
-            return env
-        from jumper_warp.diff.differentiable_env import DifferentiableEnv
-
-        return cast("VecEnv", DifferentiableEnv(env))
+        return Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
 
     return make_env
 
