@@ -16,7 +16,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "gym", "envs.rsl_rl", "envs.sb3",
     )),
     "simulation": ("Simulation and solvers", (
-        "sim.simulation", "sim.solver", "sim.mujoco", "sim.physics", "sim.dynamics", "sim.tape",
+        "sim.simulation", "sim.solver", "sim.mujoco", "sim.physics", "sim.dynamics",
     )),
     "robot": ("Robot", (
         "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.bounds", "robot.grounds",
@@ -29,10 +29,10 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "tasks.mirror", "tasks.saving",
     )),
     "gradients": ("Gradients", (
-        "diff.rollout", "diff.torch_rollout", "diff.closed_loop", "diff.differentiable_env", "diff.smooth_rewards",
+        "diff.rollout", "diff.torch_rollout", "diff.closed_loop",
     )),
     "training": ("Training", (
-        "rl.cfg", "rl.runner", "rl.ppo", "rl.shac", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
+        "rl.cfg", "rl.runner", "rl.ppo", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
         "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (

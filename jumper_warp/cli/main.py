@@ -39,7 +39,7 @@ COMMANDS = {
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
-    "doctor": "Check the installation: versions, devices, caches, a simulation.",
+    "doctor": "Check the installation: versions, and a step on each device.",
     "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
@@ -219,7 +219,9 @@ def run_command(command: Callable[[], object]) -> None:
         if not is_out_of_memory(error):
             raise
         reason = next(iter(str(error).splitlines()), "")
-        print_error(reason if "out of memory" in reason else f"out of memory: {reason:.200}".rstrip(": "))
+        reason = f"{reason:.200}" if "out of memory" in reason else f"out of memory: {reason:.200}".rstrip(": ")
+        notes = reversed(getattr(error, "__notes__", ["use fewer worlds"]))
+        print_error("; ".join([reason, *notes]))
         raise SystemExit(FAULT) from None
 
 

@@ -39,7 +39,7 @@ jumper sysid fit --help, excite --help and actuator --help list the flags.
 
 @dataclass(frozen=True)
 class SysidCfg:
-    """Identify parameters of the robot from recorded motions: writes identified.json, report.html and report.json."""
+    """Identify parameters of the robot from recorded motions: writes identified.json, report.json and plots."""
 
     data: Annotated[tuple[Path, ...], tyro.conf.Positional]  # Files of recorded motions, or folders of them
     params: str = "motors,masses,friction,latency,offsets"  # Groups of parameters to identify, separated by commas
@@ -155,7 +155,7 @@ def sysid(cfg: SysidCfg) -> None:
         print((folder / "report.json").read_text(encoding="utf-8"), end="")
     else:
         print_result(result)
-        print(folder / "report.html")
+        print(folder)
     if not result.consistent:
         print(f"jumper: not consistent: {result.inconsistency}; robot: {folder / 'inconsistent.json'}", file=sys.stderr)
         raise SystemExit(INCONSISTENT)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -19,8 +19,8 @@ from jumper_warp.cli.help import wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
-from jumper_warp.rl.cfg import UNUSED, TrainCfg
-from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
+from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
+from jumper_warp.utils.errors import InputError, is_out_of_memory
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -138,7 +138,9 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
 
 def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
     """Return the flags in unparsed arguments that a trainer does not use."""
-    names = [name.replace("_", "-") for name in UNUSED.get(trainer, ())]
+    if trainer != "rsl-rl":
+        return []
+    names = [name.replace("_", "-") for name in RSL_RL_UNUSED]
     flags = list_flags(TrainArgs, described=False)
     unused = {option for flag in flags if flag.name in names for option in flag.options}
     return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
@@ -182,41 +184,15 @@ def flagged_ranges(args: Sequence[str]) -> set[str]:
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
-    """Return the function that makes a training's environment from num_envs, seed and device.
-
-    It raises InputError: memory is too small.
-    """
-    from jumper_warp.cli.training_memory import check_memory
+    """Return the function that makes a training's environment from num_envs, seed and device."""
     from jumper_warp.envs.env import Env
 
     def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
-        """Return the training's environment, differentiable for trainer shac."""
-        check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
+        """Return the training's environment."""
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
-        env = Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
-        if args.cfg.trainer != "shac":
-            return env
-        from jumper_warp.diff.differentiable_env import DifferentiableEnv
-
-        return cast("VecEnv", DifferentiableEnv(env))
+        return Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
 
     return make_env
-
-
-def memory_message(task: TaskCfg, args: TrainArgs, error: Exception) -> str:
-    """Return one line about a training that ran out of memory: need, number of worlds that fits, and how to resume."""
-    import torch
-    import warp as wp
-
-    from jumper_warp.cli.training_memory import describe_need, memory_pools
-
-    device = torch.device(wp.device_to_torch(wp.get_device(args.cfg.device)))
-    if device.type == "cuda":
-        device = torch.device("cuda", torch.cuda.current_device())  # of this rank
-    num_envs = args.cfg.num_envs // int(os.environ.get("WORLD_SIZE", "1"))
-    pools = memory_pools(task, args.cfg.ppo, args.solver, device, rebuilt=True)
-    parts = [f"out of memory: {describe_need(pools, args.cfg.ppo, num_envs)}", *getattr(error, "__notes__", [])]
-    return "; ".join(parts)
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
@@ -299,9 +275,10 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     try:
         result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint, rate)
     except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        raise OutOfMemoryError(memory_message(task, parsed, error)) from error
+        if is_out_of_memory(error):
+            worlds = f"num_envs {parsed.cfg.num_envs} does not fit"
+            error.add_note(f"{worlds}: lower --num-envs, --ppo.num-steps or --ppo.hidden")
+        raise
     if is_rank_0:
         print(result.folder)
     return result

@@ -35,10 +35,6 @@ class LoopState(NamedTuple):
     torque: torch.Tensor  # (12, num_worlds) [N m] motor torques in the last physics step
     history: torch.Tensor  # (columns, num_worlds) earlier frames of the policy's terms with a history, oldest first
 
-    def detach(self) -> LoopState:
-        """Return the state of robots and policy detached from the graph of PyTorch's autograd."""
-        return LoopState(*(tensor.detach() for tensor in self))
-
 
 class RobotState(NamedTuple):
     """State of base and motors from which observations and rewards are computed; the first axis is the world."""
@@ -102,9 +98,8 @@ class ClosedLoop:
             raise InputError("gradients need a ground without moving blocks: train with level ground")
         if task.randomization.observation_latency:
             raise InputError(f"{task.name}: gradients need observations without latency")
-        actor = task.observations.actor
-        for term in (*actor, *task.observations.critic):
-            if term.options["history"] > 1 and (term.func.key not in STATE_TERMS or term not in actor):
+        for term in task.observations.actor:
+            if term.options["history"] > 1 and term.func.key not in STATE_TERMS:
                 raise InputError(f"{task.name}: gradients need histories of the robot's state, not of {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
@@ -113,11 +108,8 @@ class ClosedLoop:
         self.dtype = torch.float64 if double else torch.float32
         self.randomizes = bool(task.params.slots["events"])  # Whether resets randomise the robots
         self.layout = task.layout("actor")
-        self._columns = {
-            group: [(term, *task.layout(group)[term.name]) for term in getattr(task.observations, group)]
-            for group in task.groups
-        }
-        self._history_terms = [entry for entry in self._columns["actor"] if entry[0].options["history"] > 1]
+        self._columns = [(term, *self.layout[term.name]) for term in task.observations.actor]
+        self._history_terms = [entry for entry in self._columns if entry[0].options["history"] > 1]
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
@@ -207,14 +199,13 @@ class ClosedLoop:
         gravity = rotate_inverse(quat, q.new_tensor(DOWN).expand(len(q), 3))
         return RobotState(q[:, :3], quat, lin_vel, rotate_inverse(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
-    def observe(self, state: LoopState, observed: torch.Tensor, group: str = "actor") -> torch.Tensor:
-        """Return the observation of the actor or critic as a differentiable function of the state, without noise.
+    def observe(self, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
+        """Return the policy's observation (num_worlds, columns) as a differentiable function of the state; no noise.
 
-        group: "actor" or "critic". Returned: (num_worlds, columns). observed: the environment's observation of the
-        group, from which columns without derivatives, such as commands, are copied.
+        observed: the environment's observation, from which columns without derivatives, such as commands, are copied.
         """
         motion, columns, histories = self.motion(state), [], iter(self._histories(state))
-        for term, first, end in self._columns[group]:
+        for term, first, end in self._columns:
             value = observed[:, first:end].to(self.dtype)
             if term.options["history"] > 1:
                 columns.append(next(histories))

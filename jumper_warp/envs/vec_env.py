@@ -1,4 +1,4 @@
-"""Protocols of the environments that PPO and SHAC train on, and `sanitise`, which makes observations finite."""
+"""Protocols of the environments that PPO trains on, and `sanitise`, which makes observations finite."""
 
 from __future__ import annotations
 
@@ -76,29 +76,6 @@ class MirroredVecEnv(Protocol):
 
         Raises ValueError: no mirror image is defined.
         """
-        ...
-
-
-class DifferentiableVecEnv(VecEnv, Protocol):
-    """Environment for SHAC: observations and rewards are differentiable with respect to actions since `begin_window`.
-
-    A window is a call of `begin_window`, then `observe` and `step_with_gradient` in turn. Values are those of `obs`,
-    `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in every call.
-    """
-
-    def begin_window(self) -> None:
-        """Begin a window of differentiation: later derivatives do not reach actions before this call."""
-
-    def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return differentiable observations of actor and critic; derivatives are 0 where an episode just began."""
-        ...
-
-    def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return differentiable observations of actor and critic at the end of the last step, before resets."""
-        ...
-
-    def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance one policy step, with resets; return rewards (num_envs,), with gradients of differentiable terms."""
         ...
 
 

@@ -1,10 +1,7 @@
-"""Output files of an identification: a robot overlay, and a report as self-contained HTML and as JSON."""
+"""Output files of an identification: a robot overlay, a report as JSON, and plots."""
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 import math
 from collections.abc import Sequence
@@ -20,6 +17,7 @@ from jumper_warp.identification.results import Identification
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, overlay_of
 from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.plots import figure
 
 UNITS = {"angle": ("deg", 180.0 / math.pi), "rate": ("rad/s", 1.0), "torque": ("N m", 1.0), "position": ("m", 1.0),
          "orientation": ("deg", 180.0 / math.pi)}  # fmt: skip
@@ -29,14 +27,6 @@ RATIO_ROWS = {
     "no_load_speed": "no_load_speed", "cutoff_speed": "cutoff_speed",
 }  # fmt: skip
 """Row of `RandomizationCfg` that scales a quantity of `RobotValues`, by quantity."""
-TITLE = "System identification"
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15rem 0.8rem; text-align: right; border-bottom: 1px solid #ddd; }
-th:first-child, td:first-child { text-align: left; }
-.open { color: #999; } img { max-width: 100%; } .note { background: #fff6e0; padding: 0.6rem 1rem; }
-"""
 
 
 def to_json(result: Identification) -> dict[str, Any]:
@@ -81,7 +71,7 @@ def to_json(result: Identification) -> dict[str, Any]:
 
 
 def write_results(result: Identification, folder: Path, source: str) -> None:
-    """Write the identified robot (a robot overlay), `report.json` and `report.html` to a folder. Raises OSError.
+    """Write the identified robot (a robot overlay), `report.json` and plots to a folder. Raises OSError.
 
     The overlay is `identified.json`, or `inconsistent.json` if the fit is not consistent; an earlier one of the other
     name is removed. source: origin of the data, saved in the overlay.
@@ -92,7 +82,7 @@ def write_results(result: Identification, folder: Path, source: str) -> None:
     source += "" if result.consistent else f"; the fit is not consistent: {result.inconsistency}"
     identified_overlay(result, source).save(folder / name)
     write_atomically(folder / "report.json", (json.dumps(to_json(result), indent=2) + "\n").encode())
-    write_html(result, folder)
+    plot_results(result, folder)
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
@@ -136,41 +126,15 @@ def randomization_ranges(result: Identification) -> dict[str, tuple[float, float
     return rows
 
 
-def write_html(result: Identification, folder: Path) -> None:
-    """Write `report.html` to a folder, with embedded plots. Raises OSError."""
-    parts = [
-        f"<h1>{TITLE}</h1>",
-        summary(result),
-        open_directions(result),
-        "<h2>Parameters</h2>",
-        f"<p>{image(parameter_plot(result))}</p>",
-        parameter_table(result),
-        "<h2>Fit</h2>",
-        fit_table(result),
-        f"<p>{image(progress_plot(result))}</p>",
-    ]
-    for motion, start in zip(result.motions, result.initial_states, strict=True):
-        parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(result, motion, start))}</p>")
-    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{TITLE}</title><style>{STYLE}</style>"
-    write_atomically(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
+def plot_results(result: Identification, folder: Path) -> None:
+    """Write plots to a folder: `parameters.png`, `progress.png`, and `motion_<index>_<name>.png` of each motion.
 
-
-def summary(result: Identification) -> str:
-    """Return the paragraphs at the top of the HTML report: counts, χ², effort and warnings."""
-    text = (
-        f"{int(result.identified.sum())} of {len(result.parameters)} parameters are identified from {result.count} "
-        f"measured values. Mean squared weighed residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). "
-        f"{result.effort.seconds:.1f} s, {result.effort.cpu_seconds:.1f} s of CPU, "
-        f"{result.effort.world_steps / 1e6:.2f} million physics steps of {1e3 * result.dt:.3g} ms."
-    )
-    if result.mismatch > 1.0:
-        text += (
-            f"</p><p class=note>The model does not fit the data within the noise: intervals are "
-            f"{result.mismatch:.3g} times as wide as from noise alone."
-        )
-    doubts = [f"The fit is not consistent: {result.inconsistency}."] if result.inconsistency else []
-    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in (*doubts, *result.warnings))
-    return f"<p>{text}</p>{notes}<p>{html.escape(starts_line(result))}</p>"
+    Raises OSError.
+    """
+    plot_parameters(result, folder / "parameters.png")
+    plot_progress(result, folder / "progress.png")
+    for i, (motion, start) in enumerate(zip(result.motions, result.initial_states, strict=True)):
+        plot_motion(result, motion, start, folder / f"motion_{i}_{motion.motion.name}.png")
 
 
 def starts_line(result: Identification) -> str:
@@ -185,122 +149,51 @@ def starts_line(result: Identification) -> str:
     return f"starts {verb}: cost of the others {others}"
 
 
-def open_directions(result: Identification) -> str:
-    """Return an HTML list of the combinations of parameters that the data does not determine."""
-    if not result.directions:
-        return "<p>The data determines every combination of the parameters.</p>"
-    lines = "".join(f"<li>{html.escape(words)}</li>" for words in dict.fromkeys(d.words for d in result.directions))
-    return f"<h2>Undetermined combinations of parameters</h2><ul>{lines}</ul>"
-
-
-def html_table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
-    """Return an HTML table; heads: HTML of the head cells; rows: (CSS class or "", texts of the cells)."""
-    page = "<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
-    for css, cells in rows:
-        page += f"<tr{css and ' class='}{css}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
-    return page + "</table>"
-
-
-def parameter_table(result: Identification) -> str:
-    """Return the HTML table of all parameters with their 95 % intervals; rows that are not identified are grey."""
-    rows = []
-    for parameter, value, (low, high), identified in zip(
-        result.parameters, result.values, result.intervals, result.identified, strict=True
-    ):
-        cells = (parameter.name, parameter.unit, *(f"{x:.5g}" for x in (parameter.nominal, value, low, high)))
-        rows.append(("" if identified else "open", cells))
-    heads = ("parameter", "unit", "described", "found", "from", "to (95 %)")
-    return html_table(heads, rows) + "<p class=open>Grey: not identified, the prior determines the value.</p>"
-
-
-def fit_table(result: Identification) -> str:
-    """Return the HTML table of how well each motion and channel fits (χ², its limit, rms error) and of failed tests."""
-    rows, fits = [], {(fit.motion, fit.channel): fit for fit in result.fits}
-    for test in result.tests:
-        cells = (f"{test.chi2:.3f}", f"{test.limit:.3f}", "yes" if test.passed else "no")
-        if fit := fits.get((test.motion, test.channel)):
-            unit, factor = UNITS[fit.channel]
-            rows.append(
-                ("", (test.motion, test.channel, f"{fit.nominal_chi2:.4g}", *cells, f"{factor * fit.rms:.3g} {unit}"))
-            )
-        elif not test.channel or not test.passed:
-            rows.append(("", (test.motion, test.channel or "all channels", "", *cells, "")))
-    note = f"<p>If the model is right, any of these χ² exceeds its limit with probability {FAMILY_LEVEL:g}. "
-    note += (
-        "Rows <i>parameters by</i> a sensor, which compare its parameters with all others, are shown if they fail.</p>"
-    )
-    heads = ("motion", "channel", "described χ²", "found χ²", "limit", "consistent", "rms error")
-    return html_table(heads, rows) + note
-
-
-def image(figure: Any) -> str:
-    """Embed a Matplotlib figure as a PNG image in HTML."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110, bbox_inches="tight")
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
-
-
-def new_figure(width: float, height: float) -> Any:
-    """Return an empty Matplotlib figure without a window; width, height [inch]."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def parameter_plot(result: Identification) -> Any:
-    """Return a plot (Matplotlib figure) of all parameters with 95 % intervals, in prior standard deviations."""
-    figure = new_figure(10.0, 3.2)
-    axis = figure.subplots()
+def plot_parameters(result: Identification, path: Path) -> None:
+    """Plot all parameters with 95 % intervals, in prior standard deviations, into a file."""
     place = np.arange(len(result.z))
-    axis.axhspan(-1.0, 1.0, color="0.92", label="prior")
-    axis.errorbar(place, result.z, yerr=1.96 * result.std, fmt=".", capsize=2, label="found, 95 %")
     names = [parameter.quantity for parameter in result.parameters]
     edges = [i for i in place if i == 0 or names[i] != names[i - 1]]
-    axis.set_xticks(edges, [names[i] for i in edges], rotation=50, ha="right", fontsize=8)
-    axis.set(ylabel="deviations of the prior", xlim=(-1, len(place)))
-    axis.legend(fontsize=8)
-    return figure
+    with figure(path, figsize=(10.0, 3.6), title="Identified parameters") as axis:
+        axis.axhspan(-1.0, 1.0, color="0.92", label="prior")
+        axis.errorbar(place, result.z, yerr=1.96 * result.std, fmt=".", capsize=2, label="found, 95 %")
+        axis.set_xticks(edges, [names[i] for i in edges], rotation=50, ha="right", fontsize=8)
+        axis.set(ylabel="deviations of the prior", xlim=(-1, len(place)))
 
 
-def progress_plot(result: Identification) -> Any:
-    """Return a plot (Matplotlib figure) of χ² over the physics steps, with a curve for each stage of the fit."""
-    figure = new_figure(6.0, 2.6)
-    axis = figure.subplots()
-    for stage in sorted({step.stage for step in result.steps}):
-        steps = [step for step in result.steps if step.stage == stage]
-        label = "final" if stage == result.steps[-1].stage else f"stage {stage}"
-        axis.semilogy([s.world_steps / 1e6 for s in steps], [s.chi2 for s in steps], "o-", label=label)
-    axis.set(xlabel="million physics steps of all worlds", ylabel="χ² per value")
-    axis.legend(fontsize=8)
-    return figure
+def plot_progress(result: Identification, path: Path) -> None:
+    """Plot χ² over the physics steps, with a curve for each stage of the fit, into a file."""
+    with figure(path, figsize=(6.0, 3.0), title="Progress of the fit") as axis:
+        for stage in sorted({step.stage for step in result.steps}):
+            steps = [step for step in result.steps if step.stage == stage]
+            label = "final" if stage == result.steps[-1].stage else f"stage {stage}"
+            axis.semilogy([s.world_steps / 1e6 for s in steps], [s.chi2 for s in steps], "o-", label=label)
+        axis.set(xlabel="million physics steps of all worlds", ylabel="χ² per value")
 
 
-def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Plot one motion, measured and simulated, and its residuals, and return a Matplotlib figure.
+def plot_motion(result: Identification, motion: MotionResiduals, start: np.ndarray, path: Path) -> None:
+    """Plot one motion, measured and simulated, and its residuals, into a file.
 
     start: fitted coordinates of the initial state, (I,), see `MotionResiduals`.
     Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     """
-    figure = new_figure(10.0, 4.6)
-    axes = figure.subplots(2, 3, sharex=True)
     replay = MotionReplay(description=motion.description, threads=1)
     record, robots = motion.run(replay, result.z[None], start[None])
     model = motion.sensor_readings(record, robots)[..., 0]
     time = motion.motion.time - motion.motion.time[0]
     first, columns = motion.channels[0]
     unit, factor = UNITS[first]
-    for i, axis in enumerate(axes[0]):
-        column = columns.start + min(i, columns.stop - columns.start - 1)
-        name = MOTOR_JOINTS[i] if columns.stop - columns.start == 12 else "xyz"[i]
-        axis.plot(time, factor * motion.measured[:, column], ".", ms=2, label="measured")
-        axis.plot(time, factor * model[:, column], lw=1, label="model")
-        axis.set(title=f"{name} {first} [{unit}]")
-        axis.legend(fontsize=7)
-    for axis, (name, columns) in zip(axes[1], shown_channels(motion.channels), strict=False):
-        error = (motion.measured - model)[:, columns] / motion.sigma[columns]
-        axis.plot(time, np.where(motion.valid[:, columns], error, math.nan), ".", ms=1)
-        axis.set(title=f"{name}: residuals [deviations of noise]", xlabel="time [s]")
-    return figure
+    with figure(path, 2, 3, figsize=(10.0, 5.0), sharex=True, title=motion.motion.name) as axes:
+        for i, axis in enumerate(axes[0]):
+            column = columns.start + min(i, columns.stop - columns.start - 1)
+            name = MOTOR_JOINTS[i] if columns.stop - columns.start == 12 else "xyz"[i]
+            axis.plot(time, factor * motion.measured[:, column], ".", ms=2, label="measured")
+            axis.plot(time, factor * model[:, column], lw=1, label="model")
+            axis.set(title=f"{name} {first} [{unit}]")
+        for axis, (name, columns) in zip(axes[1], shown_channels(motion.channels), strict=False):
+            error = (motion.measured - model)[:, columns] / motion.sigma[columns]
+            axis.plot(time, np.where(motion.valid[:, columns], error, math.nan), ".", ms=1)
+            axis.set(title=f"{name}: residuals [noise std]", xlabel="time [s]")
 
 
 def shown_channels(channels: Sequence[tuple[str, slice]]) -> list[tuple[str, slice]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +13,6 @@ from jumper_warp.utils.checks import (
     check_bounds,
     check_count,
     check_not_negative,
-    check_positive,
     check_seed,
 )
 from jumper_warp.utils.errors import InputError
@@ -118,37 +117,6 @@ class PpoCfg:
 
 
 @dataclass(frozen=True)
-class ShacCfg:
-    """Settings of short-horizon actor-critic (SHAC).
-
-    It also uses these of `PpoCfg`: num_steps, gamma, lam, networks, reward_scale, init_std.
-    """
-
-    lr: float = 1.0e-3
-    """Initial learning rate of the actor, reduced linearly to a tenth of it over the training."""
-    critic_lr: float = 1.0e-3
-    """Constant learning rate of the critic."""
-    max_grad_norm: float = 1.0
-    """Norm to which the actor's gradient is clipped."""
-    target_rate: float = 0.2
-    """Fraction of its difference to the critic by which the target critic changes per iteration."""
-    critic_epochs: int = 8
-    """Passes of the critic over a window of num_steps policy steps."""
-    critic_minibatches: int = 4
-    """Optimiser steps of the critic per pass over a window."""
-    entropy_coef: float = 0.0
-    """Weight of the entropy bonus per policy step in the actor's loss of SHAC."""
-
-    def __post_init__(self) -> None:
-        """Raise InputError (a ValueError) if a setting of SHAC is out of range."""
-        for name in ("lr", "critic_lr", "max_grad_norm", "critic_epochs", "critic_minibatches"):
-            check_positive(name, getattr(self, name))
-        check_not_negative("entropy_coef", self.entropy_coef)
-        if not 0.0 < self.target_rate <= 1.0:
-            raise InputError(f"target_rate must be in (0, 1], got {self.target_rate}")
-
-
-@dataclass(frozen=True)
 class TrainCfg:
     """Settings of a policy's training: task, length, files, trainer and its hyperparameters."""
 
@@ -188,9 +156,8 @@ class TrainCfg:
     """Policy, run or checkpoint to start from. It is a policy's name or folder, a run's folder (its best checkpoint) or
     a checkpoint. The training starts with its actor weights and observation statistics; critic, optimiser and noise
     are new."""
-    trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """Training algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
-    comparison."""
+    trainer: Literal["ppo", "rsl-rl"] = "ppo"
+    """Training algorithm: PPO, or rsl-rl-lib's PPO for comparison."""
     stop_on_nan: bool = False
     """Whether the training ends with exit status 1, after a checkpoint, when a term is not finite for the first time.
     Without it the value counts as 0, one line names it, and the state of its world is saved."""
@@ -199,9 +166,7 @@ class TrainCfg:
     wandb: bool = False
     """Whether to upload metrics to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Hyperparameters of PPO; SHAC and rsl-rl use some of them."""
-    shac: ShacCfg = field(default_factory=ShacCfg)
-    """Further hyperparameters of SHAC."""
+    """Hyperparameters of PPO; rsl-rl uses some of them."""
 
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
@@ -212,6 +177,8 @@ class TrainCfg:
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
         check_seed(self.seed)
+        if self.trainer not in ("ppo", "rsl-rl"):
+            raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not supported with trainer rsl-rl")
@@ -226,11 +193,4 @@ RSL_RL_UNUSED = (
     "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
     "ppo.graphs", "ppo.fused",
 )  # fmt: skip
-SHAC_UNUSED = (
-    "ppo.epochs", "ppo.minibatches", "ppo.clip", "ppo.value_coef", "ppo.clip_value", "ppo.entropy_coef",
-    "ppo.final_entropy_coef", "ppo.lr", "ppo.min_lr", "ppo.max_lr", "ppo.desired_kl", "ppo.final_desired_kl",
-    "ppo.tf32", "ppo.graphs", "ppo.fused",
-)  # fmt: skip
-_SHAC = tuple(f"shac.{spec.name}" for spec in fields(ShacCfg))
-UNUSED = {"ppo": _SHAC, "shac": SHAC_UNUSED, "rsl-rl": (*RSL_RL_UNUSED, *_SHAC)}
-"""Dotted names of the settings in `TrainCfg` that each trainer does not use and accepts with their defaults only."""
+"""Dotted names of the settings in `TrainCfg` that trainer rsl-rl does not use and accepts with their defaults only."""

@@ -8,7 +8,7 @@ divergence.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -169,7 +169,17 @@ class Ppo:
 
     def statistics(self) -> dict[str, float]:
         """Return mean losses and mean episode return and length since the last call; synchronises with the device."""
-        return take_averages(STATISTICS, self._sums, self.collector.finished, self.lr, self.model.log_std)
+        *totals, count = self._sums.tolist()
+        metrics = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(STATISTICS, totals, strict=True)}
+        metrics |= {"Loss/learning_rate": self.lr.item(), "Policy/mean_std": self.model.log_std.exp().mean().item()}
+        finished = self.collector.finished
+        total_return, total_length, episodes = finished.view(3, -1).sum(1).tolist()
+        if episodes > 0.0:
+            means = {"Train/mean_reward": total_return / episodes, "Train/mean_episode_length": total_length / episodes}
+            metrics |= means
+        self._sums.zero_()
+        finished.zero_()
+        return metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return the training's state as nested dicts of tensors: `model`, `optimiser`, `lr` and `episode`."""
@@ -290,22 +300,3 @@ def optimiser_step(
     step = StepStatistics(surrogate, value_loss, entropy, asymmetry, kl.clone(), norms[0], norms[1], skipped)
     sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(kl)]), nan=0.0, posinf=0.0, neginf=0.0))
     return step
-
-
-def take_averages(
-    names: Sequence[str], sums: torch.Tensor, finished: torch.Tensor, lr: torch.Tensor, log_std: torch.Tensor
-) -> dict[str, float]:
-    """Return training metrics averaged since the last call, and reset their sums; waits for the device.
-
-    names: names of the statistics; sums: (len(names) + 1,) their sums and the number of steps; finished: (3, ...) as
-    in `Collector.finished`; lr: (); log_std: (num_actions,).
-    """
-    (*totals, count), finished_sums = sums.tolist(), finished.view(3, -1).sum(1).tolist()
-    metrics = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(names, totals, strict=True)}
-    metrics |= {"Loss/learning_rate": lr.item(), "Policy/mean_std": log_std.exp().mean().item()}
-    total_return, total_length, episodes = finished_sums
-    if episodes > 0.0:
-        metrics |= {"Train/mean_reward": total_return / episodes, "Train/mean_episode_length": total_length / episodes}
-    sums.zero_()
-    finished.zero_()
-    return metrics

@@ -14,11 +14,11 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl import distributed, resume
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
@@ -30,8 +30,6 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
-from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
-from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.threads import set_threads
@@ -150,7 +148,7 @@ def _check_best_metric(name: str, logged: set[str]) -> None:
 
 
 class TrainingRun:
-    """State of a training in this process: algorithm (`ppo`: Ppo or Shac), environment, folder, iteration, time."""
+    """State of a training in this process: algorithm, environment, folder, iteration, time."""
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
@@ -162,9 +160,8 @@ class TrainingRun:
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command, self._expected_rate = command or f"jumper train {cfg.task}", expected_rate
-        use_shac = cfg.trainer == "shac"
-        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if use_shac else make_ppo(env, cfg.ppo)
-        losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if use_shac else STATISTICS)}
+        self.ppo = make_ppo(env, cfg.ppo)
+        losses = {f"Loss/{name}" for name in STATISTICS}
         _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # of the run before this process

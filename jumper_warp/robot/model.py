@@ -60,7 +60,6 @@ def build_model(
     friction: float = 0.9,
     gravity: float = EARTH,
     device: wp.DeviceLike = None,
-    requires_grad: bool = False,
     visuals: bool = True,
     extras: Extras | None = None,
     mujoco: bool = True,
@@ -72,7 +71,6 @@ def build_model(
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
         gravity: Downward gravity of all worlds [m/s^2]; `model.gravity`, (num_worlds + 1,) vec3, can differ by world.
-        requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
         extras: Function that adds the caller's sites and shapes to the builder of one robot; it is called once, and
             every world gets a copy whose labels start with `world_i/`. A link's index is
@@ -99,7 +97,7 @@ def build_model(
         extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
-    return cast(Model, builder.finalize(device=device, requires_grad=requires_grad))
+    return cast(Model, builder.finalize(device=device))
 
 
 def other_colliders(model: Model) -> np.ndarray:

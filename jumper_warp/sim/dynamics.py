@@ -28,7 +28,7 @@ KERNEL_MODULES = (
     "actuation.command_filter", "actuation.motors", "dynamics.adjoint.constants_adjoint",
     "dynamics.adjoint.gradients", "dynamics.adjoint.leg_record", "dynamics.adjoint.multipliers",
     "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint", "dynamics.adjoint.step_adjoint",
-    "dynamics.adjoint.tape_step", "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
+    "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
     "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step", "dynamics.trajectory",
     "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
     "layout", "scalar", "state", "terrain.ground",
@@ -223,12 +223,8 @@ class JumperDynamics:
 
         self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
-        self.robot.table = wp.zeros(
-            (self.modules.layout.PARAMETER_ROWS, self.num_worlds),
-            dtype=self.real,
-            device=self.device,
-            requires_grad=model.requires_grad,
-        )
+        shape = (self.modules.layout.PARAMETER_ROWS, self.num_worlds)
+        self.robot.table = wp.zeros(shape, dtype=self.real, device=self.device)
         self.robot.ground = ground_struct(model, self.ground_shape, self.modules.ground)
         self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
         self.robot.held = wp.zeros(0, dtype=int, device=self.device)

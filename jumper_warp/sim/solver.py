@@ -29,7 +29,6 @@ from jumper_warp.robot.model import other_colliders
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.slices import WorldRange
-from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
@@ -38,8 +37,6 @@ DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
 MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
 MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
 TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
-DIFFERENTIABLE_TOLERANCE = 1.0e-6
-"""[m/s] Largest tolerance of steps with gradients, since gradients inherit the iteration's error."""
 
 
 def check_step(dt: float, substeps: int = 1) -> None:
@@ -92,12 +89,10 @@ class SolverJumper(SolverBase):
     body. Forces on other bodies and passive joints are not read. On a CPU one thread simulates a world, on a GPU
     four threads share a world and sum in a fixed order, so that results on a device are bitwise reproducible.
 
-    Where the states carry gradients (`finalize(requires_grad=True)`) `wp.Tape` can differentiate `step`, given a
-    separate state for every step (see `jumper_warp.sim.tape`). Record `dynamics.pack_masses()` or `pack_joints()` on
-    the tape for gradients with respect to the model's arrays.
+    `wp.Tape` cannot differentiate `step`: `jumper_warp.diff.rollout.Rollout` computes gradients.
 
     With `block`, each world has a block that the paws can push over the floor. A paw touches floor or block, whichever
-    is nearer. Steps with blocks have no gradients.
+    is nearer.
 
     For Newton's sensors: accelerations of all bodies, where a step's observables or `state_out.body_qdd` request them;
     contacts of the paws (`update_contacts`), where its observables request `contact_f`.
@@ -148,7 +143,6 @@ class SolverJumper(SolverBase):
         """Largest number of contact sweeps of a step in the last call (on a GPU: rounds of all paws), (num_worlds,)."""
         self.diverged: wp.array = work.diverged
         """1: the world diverged and is frozen until `reset`, int of shape (num_worlds,)."""
-        self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
         n = model.world_count
         self._state_shapes = {"joint_q": (43 * n,), "joint_qd": (38 * n,), "body_q": (21 * n,), "body_qd": (21 * n,)}
@@ -247,12 +241,9 @@ class SolverJumper(SolverBase):
         coordinates = (state_in.joint_q, state_in.joint_qd)
         out = (state_out.joint_q, state_out.joint_qd)
         if state_out.joint_q.requires_grad:
-            if drive.closed_loop or substeps != 1:
-                raise InputError("step_motors is not differentiable; see jumper_warp.diff.rollout")
-            self._differentiable.step(*coordinates, drive.joint_f, drive.body_f, *out, dt)
-        else:
-            settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
-            self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
+            raise InputError("SolverJumper has no gradients on Warp's tape; use jumper_warp.diff.rollout.Rollout")
+        settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
+        self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
         if bodies or qdd is not None or contact_f is not None:
             self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
         if qdd is not None:

@@ -15,10 +15,6 @@ class InputError(ValueError):
         super().__init__(" ".join(message.split()))
 
 
-class OutOfMemoryError(RuntimeError):
-    """Error for exhausted memory of a GPU or the machine; commands print its one line and exit with code 1."""
-
-
 MEMORY_MESSAGES = re.compile(r"Failed to allocate \d+ bytes|out of memory|can't allocate memory", re.IGNORECASE)
 """Messages of Warp, CUDA and torch's CPU allocator about exhausted memory."""
 

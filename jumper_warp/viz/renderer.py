@@ -235,26 +235,6 @@ def open_renderer(
         return RayTracer(shapes, num_bodies, size, opacity)
 
 
-def opengl_name() -> str:
-    """Return version and renderer name of the OpenGL that is available without a display.
-
-    Raises ImportError: pyglet is missing; RuntimeError: no OpenGL.
-    """
-    import pyglet
-
-    pyglet.options["headless"] = True  # read when pyglet's window module is first imported
-    try:
-        window = pyglet.window.Window(width=16, height=16, visible=False)
-        info = window.context.get_info()
-        name = f"{info.get_version_string()}, {info.get_renderer()}"
-        window.close()
-    except ImportError:
-        raise
-    except Exception as error:  # pyglet raises many kinds, of no common base
-        raise RuntimeError(f"{type(error).__name__}: {error}") from error
-    return name
-
-
 def _gl_viewer(size: tuple[int, int]) -> Any:
     """Return Newton's viewer in an invisible window of a size [px].
 

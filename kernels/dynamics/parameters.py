@@ -14,6 +14,8 @@ from ..scalar import real, vec3, vec6
 from .inertia import MassMoments
 from .leg_dynamics import LegMasses
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def load_vec3(table: wp.array2d(dtype=real), row: int, world: int) -> vec3:

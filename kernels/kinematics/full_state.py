@@ -8,6 +8,8 @@ from ..state import BaseState, leg_coord, leg_dof, load_base, load_motors
 from .five_bar import FiveBarBias, five_bar, five_bar_bias, in_plane
 from .geometry import LegGeometry
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.struct
 class Frame:

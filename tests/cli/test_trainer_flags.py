@@ -12,12 +12,7 @@ from jumper_warp.rl.rsl_rl import rsl_rl_config
 
 @pytest.mark.parametrize(
     ("trainer", "flags"),
-    [
-        ("rsl-rl", ["--ppo.reward-scale", "0.6"]),
-        ("rsl-rl", ["--wandb", "--ppo.no-graphs", "--shac.critic-lr", "0.1", "--ppo.min_lr=1e-5"]),
-        ("shac", ["--ppo.clip", "0.1"]),
-        ("ppo", ["--shac.lr", "0.1"]),
-    ],
+    [("rsl-rl", ["--ppo.reward-scale", "0.6"]), ("rsl-rl", ["--wandb", "--ppo.no-graphs", "--ppo.min_lr=1e-5"])],
 )
 def test_refuses_flags_that_the_trainer_does_not_use(trainer, flags, capsys, tmp_path):
     code, out, err = run(

@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import (
-    benchmark_solver,
-    benchmark_training,
-    gradient_cost,
-    learning_curves,
-    new_reward,
-    shac,
-    soak_test,
-)
+from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, new_reward, soak_test
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations
@@ -321,20 +313,3 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     assert values["cpu_ratio"] == pytest.approx(expected)
     for name in ("targets", "q", "qd", "table", "saturation"):
         assert 0.0 < values[f"error_{name}"] < 0.02
-
-
-def test_shac_experiment_reports_curves_and_gradient_noise_and_refuses_empty_windows(tmp_path):
-    args = shac.Args(
-        seconds=0.1, eval_interval=0.1, seeds=(0,), num_envs=8, window=2, hidden=(8,), num_jumps=3, horizons=(1, 2),
-        num_gradient_envs=4, out=tmp_path, device="cpu",
-    )  # fmt: skip
-    values = shac.main(args)
-    assert values == read_values(tmp_path)
-    for who in ("new", "trained"):
-        for name in ("physics", "score"):
-            assert all(x > 0.0 for x in values[f"deviation_{name}_{who}"])
-    assert values["curve_steps_shac_0"][-1] % (2 * 8) == 0
-    assert values["steps_to_50_percent_ppo_0"] is None
-    assert (tmp_path / "variance.png").is_file() and (tmp_path / "curves.png").is_file()
-    with pytest.raises(InputError, match="positive times and horizons"):
-        replace(args, horizons=(0,))

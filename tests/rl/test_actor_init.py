@@ -6,7 +6,6 @@ import json
 
 import pytest
 import torch
-from test_shac import SmoothPushTask
 from test_train import final_state, make_env
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
@@ -207,11 +206,9 @@ def test_refuses_a_model_of_other_sizes_without_changing_it():
 # ---------------------------------------------------------------- trainings
 
 
-@pytest.mark.parametrize(("trainer", "env"), [("ppo", make_env), ("shac", SmoothPushTask)])
-def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys, trainer, env):
-    cfg = dataclasses.replace(cfg, trainer=trainer, shac=dataclasses.replace(cfg.shac, lr=1e-9))
+def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys):
     model = actor()
-    result = train(cfg, env, actor_init=actor_init_of(model))
+    result = train(cfg, make_env, actor_init=actor_init_of(model))
     model_state, stderr = final_state(result)["ppo"]["model"], capsys.readouterr().err.splitlines()
     assert stderr[1] == "starts from pusher"
     torch.testing.assert_close(model_state["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)

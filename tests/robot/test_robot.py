@@ -298,10 +298,6 @@ def test_model_without_ground_has_no_ground_shape():
     assert "ground" not in build_model(1, ground=None, visuals=False, device="cpu").shape_label
 
 
-def test_model_with_requires_grad_has_gradients():
-    assert build_model(1, visuals=False, requires_grad=True, device="cpu").joint_q.requires_grad
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

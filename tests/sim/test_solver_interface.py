@@ -233,6 +233,14 @@ def test_explicit_torques_match_closed_loop_motors():
     assert largest > 10.0
 
 
+def test_refuses_a_state_with_gradients():
+    sim = simulation(1)
+    out = sim.model.state()
+    out.joint_q.requires_grad = True
+    with pytest.raises(InputError, match=r"no gradients on Warp's tape; use jumper_warp\.diff\.rollout"):
+        sim.solver.step(sim.state, out, None, None, DT)
+
+
 def test_step_does_not_write_its_input():
     sim = simulation(2)
     launch(sim)
