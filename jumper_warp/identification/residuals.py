@@ -24,6 +24,9 @@ LONGEST_LATENCY = 0.05  # [s] targets sent up to this long before the first row 
 SETTLING = 0.02
 """[s] Initial time without residuals if a robot on the ground is not at rest: its paws strike the ground at times that
 depend on micrometres."""
+JITTER = 0.01
+"""[1] Largest deviation of uniform time stamps from a straight line over their period, and tolerance on the number of
+physics steps in a period. Clocks round stamps: those of Unix time to 0.24 µs."""
 FAR_APART = math.radians(20.0)
 """[rad] Root mean square of angle minus target above which `check_signs` compares their signs."""
 PIECE = 0.25  # [s] length of the pieces that motions on the ground are first cut into
@@ -68,40 +71,39 @@ class MotionResiduals:
         motion = rows_of(whole, first, end)
         self.motion, self.parameters, self.description = motion, parameters, description
         self.free = motion.base == "free"
-        period = self._make_grid(dt)
+        begin = self._make_grid(dt)
         self.lead = self.stride * min(math.ceil(LONGEST_LATENCY / (self.stride * self.dt)), 10**6 if first else 0)
-        steps = motion.time[0] + self.dt * np.arange(-self.lead, self.rows * self.stride)
-        held_row = np.searchsorted(whole.time, steps + 1.0e-6 * period, side="right") - 1
-        self.target = whole.target[np.maximum(held_row, 0)]
+        self.target = mean_targets(whole, begin + self.dt * np.arange(-self.lead, self.rows * self.stride + 1))
         self._collect_measurements(noise)
         self.initial = InitialStatePrior(motion, noise, description)
         self.start_size = self.initial.size
         if self.free and not self.initial.resting:
-            self.valid[motion.time < motion.time[0] + SETTLING] = False
+            self.valid[self._grid_row < SETTLING / (self.stride * self.dt) - JITTER] = False
         if not self.valid.any():
             raise NothingMeasured(f"motion {motion.name}: no measurements to compare with a replay")
         self.jacobian_worlds = self._plan_jacobian()
 
     def _make_grid(self, dt: float | None) -> float:
-        """Align the rows of a recording with physics steps of at most dt [s]; return the median time between rows [s].
+        """Align the rows of a recording with physics steps of at most dt [s]; return the time [s] of the first step.
 
-        Sets stride, dt, rows and the row's position on the grid. Raises InputError: a gap above `LONGEST_GAP`.
+        Sets stride, dt, rows and the row's position on the grid. Stamps that are uniform but for `JITTER` count as
+        uniform. Raises InputError: a gap above `LONGEST_GAP`.
         """
-        motion = self.motion
+        motion, index = self.motion, np.arange(len(self.motion.time), dtype=float)
         gaps = np.diff(motion.time)
-        if gaps.max() > LONGEST_GAP:
+        if gaps.max() > (1.0 + JITTER) * LONGEST_GAP:
             row = int(np.argmax(gaps)) + 1
             raise InputError(f"motion {motion.name}: gap of {gaps.max():.3g} s before row {row}: split it there")
-        period = float(np.median(gaps))
-        uniform = bool(
-            np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period
-        )
-        self.stride, self.dt = grid_steps(period, dt) if uniform else (1, grid_steps(1.0, dt)[1])
-        self._grid_row = np.arange(len(motion.time), dtype=float)
-        if not uniform:
-            self._grid_row = (motion.time - motion.time[0]) / self.dt
+        time, begin = motion.time - motion.time[0], 0.0
+        period, middle = np.polyfit(index - index.mean(), time, 1)
+        if np.abs(time - middle - period * (index - index.mean())).max() < JITTER * period:
+            (self.stride, self.dt), self._grid_row = grid_steps(period, dt), index
+            begin = middle - period * index.mean()
+        else:
+            self.stride, self.dt = 1, grid_steps(1.0, dt)[1]
+            self._grid_row = time / self.dt
         self.rows = int(math.ceil(self._grid_row[-1] - 1.0e-9)) + 1
-        return period
+        return float(motion.time[0] + begin)
 
     def _collect_measurements(self, noise: NoiseLevels) -> None:
         """Collect the measured values of the motion with their noise, and mark missing ones.
@@ -280,6 +282,21 @@ def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
     return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})
 
 
+def mean_targets(motion: RecordedMotion, edges: np.ndarray) -> np.ndarray:
+    """Return the mean target [rad] in each of S time intervals, (S, 12); targets are held until the next row.
+
+    edges: (S + 1,) [s], rising. The first target also holds before the first row. Means are continuous in the time
+    stamps, so errors of stamps below a physics step change them by less than a target that is moved to another step.
+    """
+    first = max(int(np.searchsorted(motion.time, edges[0], side="right")) - 1, 0)
+    end = max(int(np.searchsorted(motion.time, edges[-1])), first + 1)
+    target, changes = motion.target[first:end], motion.time[first + 1 : end] - edges[0]
+    knots = np.concatenate([[0.0], changes, [edges[-1] - edges[0]]])
+    area = np.concatenate([np.zeros((1, 12)), np.cumsum(np.diff(knots)[:, None] * target, axis=0)])
+    at_edges = np.stack([np.interp(edges - edges[0], knots, column) for column in area.T], axis=1)
+    return np.diff(at_edges, axis=0) / np.diff(edges)[:, None]
+
+
 def pieces_of(
     motion: RecordedMotion,
     parameters: ParameterSet,
@@ -304,7 +321,7 @@ def pieces_of(
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
-    """Divide the time between two recorded rows into equal physics steps of at most dt.
+    """Divide the time between two recorded rows into equal physics steps of at most dt, within 1 % (`JITTER`).
 
     Returns (number of steps in a period [s], step [s]); dt: by default 1/480 s. Raises InputError: dt outside 1e-6 to
     0.01 s.
@@ -312,5 +329,5 @@ def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
     longest = 1.0 / 480.0 if dt is None else dt
     if not 1.0e-6 <= longest <= 0.01:
         raise InputError(f"dt must lie in 1e-6 to 0.01 s, got {dt}")
-    steps = max(1, math.ceil(period / longest - 1.0e-6))
+    steps = max(1, math.ceil(period / longest - JITTER))
     return steps, period / steps
