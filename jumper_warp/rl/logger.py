@@ -97,11 +97,9 @@ class TrainingLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close all outputs of the log: file, terminal, TensorBoard and Weights & Biases."""
-        self._progress.stop()
-        for file in (self._file, self._events):
-            with suppress(OSError):
-                if file:
-                    file.close()
+        for close in (self._progress.stop, self._file.close, *([self._events.close] if self._events else [])):
+            with suppress(OSError):  # such as that of a closed terminal
+                close()
         if self._wandb:
             self._wandb.finish()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shlex
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
@@ -30,6 +28,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
+from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.threads import set_threads
@@ -55,26 +54,6 @@ class TrainResult(NamedTuple):
     metrics: dict[str, float]  # last logged metrics
 
 
-class StopRequest:
-    """Context manager that records Ctrl-C or SIGTERM as a request to stop; a second Ctrl-C raises KeyboardInterrupt."""
-
-    def __enter__(self) -> StopRequest:
-        """Install handlers of Ctrl-C and SIGTERM that set `requested`."""
-        self.requested = False
-        self._previous = {each: signal.signal(each, self._on_signal) for each in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Restore the previous handlers of Ctrl-C and SIGTERM."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Handle Ctrl-C or SIGTERM: set the request, and restore the default handler of Ctrl-C."""
-        self.requested = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
     actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
@@ -87,8 +66,8 @@ def train(
     two CPU cores; one line warns of less than half of it (0: no warning).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
-    SystemExit, after a checkpoint was saved: with code INTERRUPTED if Ctrl-C or SIGTERM stopped the training, with a
-    message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted.
+    SystemExit, after a checkpoint was saved: with code INTERRUPTED if a signal stopped the training (`StopRequest`),
+    with a message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted.
     """
     set_threads(cfg.threads)
     rank = distributed.init_distributed(cfg.device, cfg.threads)
@@ -226,6 +205,7 @@ class TrainingRun:
                 watch.start()
                 ppo.set_progress(self._progress())
                 ppo.iterate(partial(self._mark, watch, log))
+                stop.can_abort = False
                 self.iteration += 1
                 if self.iteration == first_iteration:
                     self._start_clock()
@@ -245,6 +225,7 @@ class TrainingRun:
                     log.print_line(f"ended by {self._reason(stop)}")
                 if is_last or saves:
                     self._save(log, is_last, stop)
+                stop.can_abort = True
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
     def _open_log(self) -> TrainingLog | _NoLog:
@@ -432,16 +413,21 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     def end_in(iteration: int) -> Path | None:
         """Return the folder for the last checkpoint if the training is over after this iteration, else None."""
         nonlocal clock_start, failure
+        stop.can_abort = False
         clock_start = min(clock_start, now := time.perf_counter())
         kept, failure = rescue_folder(folder, config, [CONFIG])
         found = report_non_finite(env, kept, config, iteration, print_line)
         if found and cfg.stop_on_nan:
             failure = failure or f"--stop-on-nan: {found[0]}"
-        return kept if failure or 0.0 < cfg.max_seconds <= now - clock_start else None
+        over_time = 0.0 < cfg.max_seconds <= now - clock_start
+        stop.can_abort = not is_last_iteration(iteration, cfg, bool(failure) or stop.requested or over_time)
+        return None if stop.can_abort else kept
 
-    with write_lock(folder):
+    with write_lock(folder), StopRequest() as stop:
         settings = (cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder, end_in)
         iteration = train_rsl_rl(adapter, *settings).current_learning_iteration + 1
     if failure:
         raise SystemExit(f"jumper: {failure}")
+    if stop.requested:
+        raise SystemExit(INTERRUPTED)
     return TrainResult(folder, iteration, time.perf_counter() - begin, {})

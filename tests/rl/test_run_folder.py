@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -29,12 +28,12 @@ class FaultyTask(PushTask):
 
 
 class DeletedTask(PushTask):
-    """Task during whose third iteration the folder of the run is deleted."""
+    """Task during whose third iteration the folder of the run vanishes, at once, as no writer can add a file to it."""
 
     def step(self, action):
         super().step(action)
         if self.steps == 2 * SMALL.num_steps + 1:
-            shutil.rmtree(self.folder())
+            self.folder().rename(self.root / "deleted")
 
     @classmethod
     def folder(cls):

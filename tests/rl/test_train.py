@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -17,7 +18,8 @@ from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, StopRequest, TrainingRun, train
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
+from jumper_warp.rl.stop_request import StopRequest
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
@@ -146,7 +148,7 @@ def test_resume_latest_raises_without_a_run(cfg):
         train(dataclasses.replace(cfg, resume="latest"), make_env)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, number, capsys):
     class SignallingTask(PushTask):  # sends the signal to this process
         def step(self, action):
@@ -174,6 +176,67 @@ def test_second_interrupt_raises_immediately(cfg):
 
     with pytest.raises(KeyboardInterrupt):
         train(cfg, InterruptingTask)
+
+
+class InterruptedSave(PushTask):
+    """Task that sends Ctrl-C to this process in the third iteration, and again while its state is saved."""
+
+    def step(self, action):
+        super().step(action)
+        if self.steps == 40:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def metrics(self):
+        self.send_again()
+        return super().metrics()
+
+    def state_dict(self):
+        self.send_again()
+        return super().state_dict()
+
+    def send_again(self):
+        if self.steps == 48:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_further_interrupts_do_not_prevent_the_last_checkpoint(cfg):
+    with pytest.raises(SystemExit, match="130"):
+        train(dataclasses.replace(cfg, max_iterations=100), InterruptedSave)
+    assert list(cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt"))
+
+
+def test_hangup_is_ignored_if_it_was_before(cfg, monkeypatch):
+    class HangingUpTask(PushTask):  # as a terminal that is closed
+        def step(self, action):
+            super().step(action)
+            if self.steps == 1:
+                os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # by nohup
+    try:
+        assert train(cfg, HangingUpTask).iteration == cfg.max_iterations
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
+def test_training_runs_in_a_thread(cfg, trainer):
+    cfg = dataclasses.replace(cfg, trainer=trainer)
+    with ThreadPoolExecutor(1) as pool:
+        result = pool.submit(train, cfg, make_env, as_rsl_rl=RslRlVecEnv).result()
+    assert result.iteration == cfg.max_iterations
+
+
+def test_interrupted_training_with_rsl_rl_ends_with_a_checkpoint(cfg):
+    class SignallingTask(PushTask):
+        def step(self, action):
+            super().step(action)
+            if self.steps == 20:  # in the second iteration of 16 steps
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(SystemExit, match="130"):
+        train(dataclasses.replace(cfg, trainer="rsl-rl", save_interval=100), SignallingTask, as_rsl_rl=RslRlVecEnv)
+    assert list(cfg.log_root.glob("push/*/model_1.pt"))
 
 
 def test_time_limit_ends_the_training_with_a_checkpoint(cfg):

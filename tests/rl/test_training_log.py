@@ -1,5 +1,6 @@
 import contextlib
 import dataclasses
+import errno
 import json
 import resource
 
@@ -153,15 +154,18 @@ def test_terminal_shows_the_estimated_time_left(tmp_path, capsys, monkeypatch, c
     assert "4 min left" in capsys.readouterr().err
 
 
-def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
-    class BrokenPipe:
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("code", [errno.EPIPE, errno.EIO])
+def test_broken_pipe_or_closed_terminal_does_not_stop_logging(tmp_path, monkeypatch, terminal, code):
+    class Broken:
         def write(self, _):
-            raise BrokenPipeError(32, "Broken pipe")
+            raise OSError(code, "")
 
         flush = fileno = isatty = lambda self: 0
 
+    monkeypatch.setenv("FORCE_COLOR", "1" if terminal else "")
     with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
-        log._console.file = BrokenPipe()
+        log._console.file = Broken()
         for iteration in (1, 2):
             log.log(iteration, METRICS, remaining=5.0)
     assert iterations(tmp_path / METRICS_FILE) == [1, 2]
