@@ -93,7 +93,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
     if payload := values.pop("payload", None):
         run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
         folder.mkdir(parents=True, exist_ok=True)
-        payload_overlay(Conditions().overlay(run.policy.config), payload).save(values["robot"])
+        payload_overlay(run.recipe.robot, payload).save(values["robot"])
     conditions = Conditions(**values, seed=seed, device=args.device, threads=args.threads)
     flags = with_trials(run.evaluation.flags, args.trials)
     run.settings["commands"] = commands_of(flags)

@@ -8,8 +8,7 @@ import pytest
 
 import jumper_warp
 from jumper_warp import registry
-from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import (
     TASKS,
     TaskEntry,
@@ -22,7 +21,7 @@ from jumper_warp.registry import (
     trainer_settings,
 )
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.tasks.saving import TaskError, task_to_json
 from jumper_warp.utils.errors import InputError
 
 PROJECT_TASKS = (
@@ -325,8 +324,8 @@ def test_saved_configuration_loads_no_installed_task(install):
     new = task_to_json(make_task("vertical-jump")) | {"name": "low-jump"}
     new["rewards"][0]["func"] = "their_tasks:reward"
     for saved in (new, {"name": "low-jump", "terms": [], "rules": []}):
-        with pytest.raises(PolicyError):
-            restored_task({"env": {"task": saved}}, leave_out=())
+        with pytest.raises(TaskError):
+            Recipe.from_json({"env": {"task": saved}}, [])
     assert "their_tasks" not in sys.modules and "low-jump" not in TASKS
 
 

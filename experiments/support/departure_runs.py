@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -13,15 +13,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jumper_warp.cli.train import env_maker, parse_train
+from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.warm_start import actor_init_from_policy
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
-from jumper_warp.rl.runner import CONFIG, train
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.rl.run_folder import CONFIG
+from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.plots import figure
 from support.departures import Ablation
@@ -64,10 +63,10 @@ JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
 }
 
 
-def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
-    """Parse the arguments of `jumper train`: return the settings, and the task with an ablation."""
-    parsed, task = parse_train(arguments)
-    return parsed, task if isinstance(ablation, str) else ablation(task)
+def parse(ablation: Ablation, arguments: list[str]) -> Recipe:
+    """Return the recipe that arguments of `jumper train` make, with the task of an ablation."""
+    recipe, _ = parse_train(arguments)
+    return recipe if isinstance(ablation, str) else replace(recipe, task=ablation(recipe.task))
 
 
 def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
@@ -75,17 +74,16 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
 
     arguments: of `jumper train`. Raises InputError: the existing training has other settings.
     """
-    (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.max_iterations)}")):
+    recipe, name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    if checkpoints := sorted(recipe.train.log_root.glob(f"*/*/{name.format(recipe.train.max_iterations)}")):
         config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
-        requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
-        changed = {key for key in requested.keys() - NOT_COMPARED if requested[key] != config["train"].get(key)}
-        if changed or config["env"]["task"] != task_to_json(task):
+        requested = recipe.to_json()
+        train_settings = requested["train"]
+        changed = [k for k in train_settings.keys() - NOT_COMPARED if train_settings[k] != config["train"].get(k)]
+        if changed or config["env"]["task"] != requested["env"]["task"]:
             raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
         return checkpoints[-1]
-    start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
-    command = shlex.join(["jumper", "train", *arguments])
-    result = train(parsed.cfg, env_maker(task, parsed), command, actor_init=start)
+    result = train(recipe, command=shlex.join(["jumper", "train", *arguments]))
     return result.folder / name.format(result.iteration)
 
 

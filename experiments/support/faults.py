@@ -45,7 +45,7 @@ def warm_up() -> None:
     It starts no threads, as a forked process would lack them.
     """
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # a forked process could not use a GPU
-    for module in ("cli.train", "cli.resumed", "rl.runner", "envs.env", "policies.restore"):
+    for module in ("cli.train", "training", "envs.env"):
         importlib.import_module(f"jumper_warp.{module}")
     wp.config.log_level = wp.LOG_WARNING
     init_warp()

@@ -19,9 +19,8 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
-from jumper_warp.policies.conditions import shared_config
+from jumper_warp.policies.conditions import shared_robot
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
@@ -264,10 +263,14 @@ class FlightRun(Run):
         super().__init__()
         self.turn: Policy = open_policy(args.policy)
         self.landing: Policy | None = open_policy(landing) if landing else None
-        turning = restored_task(self.turn.config)
+        self.recipes = {"the turning policy": self.turn.recipe()}
+        turning = self.recipes["the turning policy"].tested_task(randomize=False)
         if turning.evaluation_suite != "attitude":
             raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
-        takes_off = make_task(jump) if self.landing is None else restored_task(self.landing.config)
+        takes_off = make_task(jump)
+        if self.landing is not None:
+            self.recipes["the landing policy"] = recipe = self.landing.recipe()
+            takes_off = recipe.tested_task(randomize=False)
         if takes_off.evaluation_suite not in HEIGHTS:
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
@@ -291,9 +294,8 @@ class FlightRun(Run):
         """Return an environment of `count` robots with the skills JUMP and TURN."""
         conditions = self.conditions
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
-        policies = {"the turning policy": self.turn, "the landing policy": self.landing}
-        configs = {name: policy.config for name, policy in policies.items() if policy is not None}
-        settings = conditions.env_settings(shared_config(configs, conditions))
+        robots = {name: recipe.robot for name, recipe in self.recipes.items()}
+        settings = conditions.env_settings(shared_robot(robots, conditions))
         env = Env(tasks, count, handovers=handovers, **settings)
         for policy in (self.turn, self.landing):
             if policy is not None:

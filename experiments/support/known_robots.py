@@ -16,7 +16,7 @@ from jumper_warp.identification.recording import KINDS, Plan, measure, replay_pl
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.report import identified_overlay
 from jumper_warp.identification.results import Identification
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
@@ -136,7 +136,7 @@ def policy_errors(name: str, jumps: int, case: Case, result: Identification, fol
             overlays[robot].save(folder / f"{robot}.json")
         policy = open_policy(name)
         conditions = Conditions(device="cpu", robot=folder / f"{robot}.json" if robot in overlays else None)
-        env = env_of_policy(policy, jumps, conditions)
+        env = env_of_recipe(policy.recipe(), jumps, conditions)
         policy.to(env.device)
         log = run_jumps(policy.act, env, np.linspace(0.5, 1.0, jumps))
         apex[robot], success[f"policy_success_{robot}"] = log.apex.copy(), float(np.mean(log.outcome.reached))

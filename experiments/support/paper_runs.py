@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.cli.train import env_maker, parse_train
+from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
@@ -22,8 +22,8 @@ from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import CHECKPOINTS
-from jumper_warp.rl.runner import train
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.training import train
 from jumper_warp.utils.metrics import Metrics, measure
 from support.learning import places_ahead
 
@@ -77,10 +77,10 @@ def train_arm(arguments: Sequence[str]) -> tuple[Path, int]:
 
     Returns the run's folder, and the number of policy steps of all worlds in an iteration.
     """
-    parsed, task = parse_train([*arguments, "--resume", "latest-or-new"])
+    recipe, checkpoint = parse_train([*arguments, "--resume", "latest-or-new"])
     command = shlex.join(["jumper", "train", *arguments])
-    result = train(parsed.cfg, env_maker(task, parsed), command, checkpoint=parsed.checkpoint)
-    return result.folder, parsed.cfg.num_envs * parsed.cfg.ppo.num_steps
+    result = train(recipe, checkpoint=checkpoint, command=command)
+    return result.folder, recipe.train.num_envs * recipe.train.ppo.num_steps
 
 
 def goals_of_test(test: str, num_jumps: int) -> np.ndarray:

@@ -6,15 +6,13 @@ The policy comes first: its task decides which flags there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.cli.renamed_flags import join_height_range
-from jumper_warp.utils.errors import InputError, suggestion
-from jumper_warp.utils.files import read_json
+from jumper_warp.utils.errors import suggestion
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
@@ -46,14 +44,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     policy = policy_of("evaluate", ABOUT, args)
     args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
-    task = saved_task(policy, modules)
+    run = open_run(policy, modules)
     if SUITE in args:
-        run_suite(task, args, modules)
+        run_suite(run.task, args, modules)
         return
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
-    cfg = parse("evaluate", task, args, EvaluateCfg, lambda kind: kind.flags)
-    evaluate(open_run(policy, modules), cfg)
+    evaluate(run, parse("evaluate", run.task, args, EvaluateCfg, lambda kind: kind.flags))
 
 
 def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType]) -> None:
@@ -95,23 +92,6 @@ def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
         from jumper_warp.evaluation.run import EvaluationRun
 
         return EvaluationRun(policy, modules)
-
-
-def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
-    """Return the task of a policy or of a training run, from config.json in its folder, without PyTorch.
-
-    Raises PolicyError or CheckpointError: it cannot be used.
-    """
-    from jumper_warp.policies.catalog import CONFIG, find_policy
-    from jumper_warp.policies.restore import restored_task
-
-    path = Path(source)
-    folder = path.parent.parent if path.suffix == ".pt" else find_policy(source)
-    try:
-        config = read_json(folder / CONFIG, "configuration")
-    except InputError:
-        return open_run(source, modules).task
-    return restored_task(config, modules)
 
 
 def parse(command: str, task: TaskCfg, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]) -> Any:

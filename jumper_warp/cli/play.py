@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import ModuleType
 
-from jumper_warp.cli.evaluate import open_run, parse, policy_of, saved_task
+from jumper_warp.cli.evaluate import open_run, parse, policy_of
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
@@ -42,5 +42,5 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    cfg = parse("play", saved_task(policy, modules), args, PlayCfg, lambda kind: kind.play)
-    play(open_run(policy, modules), cfg)
+    run = open_run(policy, modules)
+    play(run, parse("play", run.task, args, PlayCfg, lambda kind: kind.play))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import shlex
 import sys
@@ -18,18 +17,18 @@ from jumper_warp.cli.flags import list_flags, option_of, switch_of, values_of
 from jumper_warp.cli.help import wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
-from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
+from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
-from jumper_warp.utils.errors import InputError, is_out_of_memory
+from jumper_warp.utils.errors import is_out_of_memory
+from jumper_warp.utils.files import parse_json
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-    import torch
-
-    from jumper_warp.envs.vec_env import VecEnv
-    from jumper_warp.rl.runner import MakeEnv, TrainResult
+    from jumper_warp.recipe import Recipe
+    from jumper_warp.rl.checkpoint import Checkpoint
+    from jumper_warp.rl.runner import TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
 
@@ -67,14 +66,12 @@ class TrainArgs:
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""
-    overlay: Annotated[Any, tyro.conf.Suppress] = None  # Overlay of --robot or the resumed run, with flags' ranges
-    checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
 
 
-def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
-    """Return the settings of `jumper train`, and the task changed by --env flags; exits with 0 after help.
+def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
+    """Return the recipe that the arguments of `jumper train` make, and the checkpoint that is resumed.
 
-    args: the task, then flags. With --resume the saved settings of the run are the defaults.
+    Exits with 0 after help. args: the task, then flags. With --resume the saved recipe of the run has the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
     a flag, or there is no such run.
     """
@@ -86,29 +83,46 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
     preset, args = preset_flags(name, entry, args[1:]), args[1:]
-    default, task = TrainArgs(entry.training(name)), make_task(name)
-    flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
-    session = {name: values[0] for name, values in flags.items() if values}
-    if "resume" in session:
-        from jumper_warp.cli.resumed import settings_of_run
-        from jumper_warp.rl.resume import find_checkpoint
+    from jumper_warp.recipe import Recipe
+    from jumper_warp.tasks.observations import with_history
+    from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-        named = dataclasses.replace(default.cfg, **session)
-        if checkpoint := find_checkpoint(named):
-            settings, task = settings_of_run(checkpoint, default.cfg)
-            default = dataclasses.replace(default, **settings)
-    parsed, flagged = parse_settings(task, default, [*preset, *args])
+    recipe, checkpoint = resumed(Recipe.of(name), args)
+    parsed, task = parse_settings(recipe, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     if unused := unused_flags(parsed.cfg.trainer, args):
         raise UsageError(f"{', '.join(unused)}: not supported with trainer {parsed.cfg.trainer}")
-    from jumper_warp.tasks.observations import with_history
-    from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
+    robot = overlay_in(args) or recipe.robot
+    if robot is not None:
+        task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
+    given = {name: getattr(parsed, name) for name in ("solver", "randomize", "noise")}
+    return Recipe(with_history(task, parsed.history), parsed.cfg, robot=robot, **given), checkpoint
 
-    overlay = overlay_in(args) or default.overlay
-    if overlay is not None:
-        flagged, overlay = with_flagged_ranges(task, flagged, overlay, flagged_ranges([*preset, *args]))
-    return dataclasses.replace(parsed, overlay=overlay), with_history(flagged, parsed.history)
+
+def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
+    """Return the recipe and the checkpoint of the run that --resume selects in unparsed arguments.
+
+    Without the flag, and for a new run, the given recipe and None. Raises CheckpointError: the run is of another task,
+    or cannot be used.
+    """
+    flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
+    session = {name: values[0] for name, values in flags.items() if values}
+    if "resume" not in session:
+        return recipe, None
+    from jumper_warp.rl.checkpoint import CheckpointError
+    from jumper_warp.rl.resume import find_checkpoint
+
+    checkpoint = find_checkpoint(dataclasses.replace(recipe.train, **session))
+    if checkpoint is None:
+        return recipe, None
+    try:
+        saved = recipe.from_json(parse_json(checkpoint.state["config"], "config"), defaults=recipe.train)
+    except ValueError as error:
+        raise CheckpointError(f"{checkpoint.path}: {error}") from error
+    if saved.train.task != recipe.train.task:
+        raise CheckpointError(f"{checkpoint.path}: of a run of {saved.train.task:.60}, not of {recipe.train.task}")
+    return saved, checkpoint
 
 
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
@@ -146,19 +160,19 @@ def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
 
 
-def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings parsed from `args`, and the task changed by its --env flags.
+def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
+    """Return the settings parsed from `args`, with the recipe's as defaults, and the task changed by its --env flags.
 
     Exits with 0 after help. Raises InputError: a setting is out of range.
     """
     from jumper_warp.cli.task_flags import flags_of, with_flags
 
-    flags = flags_of(task)
+    task, flags = recipe.task, flags_of(recipe.task)
     made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
-    defaults = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
-    settings: dict[str, Any] = {"default": kind(**defaults), "short": SHORT_HELP}
-    parsed = parse(kind, f"train {task.name}", args, description=f"Train a policy on {task.name}.", **settings)
+    default = kind(recipe.train, solver=recipe.solver, randomize=recipe.randomize, noise=recipe.noise)
+    about = f"Train a policy on {task.name}."
+    parsed = parse(kind, f"train {task.name}", args, description=about, default=default, short=SHORT_HELP)
     return parsed, with_flags(task, parsed.env)
 
 
@@ -183,18 +197,6 @@ def flagged_ranges(args: Sequence[str]) -> set[str]:
     return {name for name in RANDOMIZED if f"--env.randomization.{name.replace('_', '-')}" in options}
 
 
-def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
-    """Return the function that makes a training's environment from num_envs, seed and device."""
-    from jumper_warp.envs.env import Env
-
-    def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
-        """Return the training's environment."""
-        settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
-        return Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
-
-    return make_env
-
-
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     """Return the command line that repeats a training, without --resume and --init-policy, for a later resume.
 
@@ -212,13 +214,15 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     return shlex.join(["jumper", "train", *kept])
 
 
-def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
-    """Print the expected duration of a training on a CPU, unless it is short; presets: names of the task's presets."""
+def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:
+    """Print the expected duration of a training on a CPU, unless it is short.
+
+    done: iterations before a resume; preset: whether a preset is used; presets: names of the task's presets.
+    """
     from jumper_warp.rl.logger import format_duration
 
-    cfg, done = args.cfg, args.checkpoint.state["iteration"] if args.checkpoint else 0
     steps, threads = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs, checked_threads(cfg.threads)
-    rate = PRESET_STEPS_PER_SECOND * min(threads, 2) / 2 if args.preset else CPU_STEPS_PER_SECOND * threads
+    rate = PRESET_STEPS_PER_SECOND * min(threads, 2) / 2 if preset else CPU_STEPS_PER_SECOND * threads
     seconds, reason = steps / rate, f": {steps / 1.0e6:.1f} M steps at {rate:,.0f} steps/s"
     if 0.0 < cfg.max_seconds < seconds:
         seconds, reason = cfg.max_seconds, ""
@@ -230,53 +234,33 @@ def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
     print(f"without a GPU this training takes about {duration}{reason}{advice}", file=sys.stderr)
 
 
-def check_saving(task: TaskCfg) -> None:
-    """Raise InputError unless the task, saved as JSON and read back, is unchanged."""
-    from jumper_warp.cli.resumed import loaded_modules
-    from jumper_warp.tasks.saving import task_from_json, task_to_json
-
-    if task_from_json(json.loads(json.dumps(task_to_json(task))), loaded_modules()) != task:
-        raise InputError(f"{task.name} differs from the original after it is saved as JSON and loaded")
-
-
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Run `jumper train` with the given arguments, and print the run's folder on rank 0.
 
     modules: the user's, whose tasks are registered already.
-    Raises as `parse_train`, `jumper_warp.policies.warm_start.actor_init_from_policy` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train` and `jumper_warp.training.train`.
     """
     args = [*args[:1], *use_new_names(args[1:], TrainArgs())]
-    parsed, task = parse_train(args)
-    from jumper_warp.rl.runner import train
-    from jumper_warp.tasks.mirror import mirror_of
+    recipe, checkpoint = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
+    from jumper_warp.training import train
     from jumper_warp.utils.runtime import configure_device
 
-    check_saving(task)
-    if parsed.cfg.ppo.symmetry != "off":
-        mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
-    actor_init = None
-    if parsed.cfg.init_policy and not parsed.checkpoint:
-        from jumper_warp.policies.warm_start import actor_init_from_policy
-
-        actor_init = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
+    cfg, task, preset = recipe.train, recipe.task, bool(values_of("--preset", args))
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     rate = 0.0
-    if is_rank_0 and configure_device(parsed.cfg.device, parsed.cfg.threads).driver is None:
-        report_cpu_time(parsed, () if parsed.preset or parsed.checkpoint else find_task(task.name)[1].presets)
-        if parsed.preset and parsed.solver == "jumper":
+    if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
+        presets = () if preset or checkpoint else find_task(task.name)[1].presets
+        report_cpu_time(cfg, checkpoint.state["iteration"] if checkpoint else 0, preset, presets)
+        if preset and recipe.solver == "jumper":
             rate = PRESET_STEPS_PER_SECOND
-    if is_rank_0 and parsed.randomize and (words := range_words(task, parsed.overlay, changed=True)):
+    if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
-    as_rsl_rl = None
-    if parsed.cfg.trainer == "rsl-rl":
-        from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
-    make_env, command = env_maker(task, parsed), command_line(args, modules)
     try:
-        result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint, rate)
+        result = train(recipe, checkpoint=checkpoint, command=command_line(args, modules), expected_rate=rate)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
-            worlds = f"num_envs {parsed.cfg.num_envs} does not fit"
+            worlds = f"num_envs {cfg.num_envs} does not fit"
             error.add_note(f"{worlds}: lower --num-envs, --ppo.num-steps or --ppo.hidden")
         raise
     if is_rank_0:

@@ -21,8 +21,9 @@ from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.policy import Policy
+from jumper_warp.recipe import Recipe
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
@@ -41,11 +42,11 @@ DAMPING = 1.0e-2  # [1] Levenberg-Marquardt damping of the first step
 AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 
-def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
+def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     """Build the groups of simulated jumps for fine-tuning: `nominal`, `late` (with latency), `randomized`.
 
-    Empty groups are left out. Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises
-    InputError: the policy does not jump.
+    Empty groups are left out. Goals are evenly spaced over the range in `cfg`. recipe: of the policy.
+    Raises InputError: the policy does not jump.
     """
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
 
@@ -69,11 +70,11 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
                 randomize=randomize, noise=name == "randomized", seed=cfg.seed, stream="tuning", device=cfg.device,
                 threads=cfg.threads,
             )  # fmt: skip
-            robot = conditions.overlay(policy.config)
+            robot = conditions.overlay(recipe.robot)
             if robot is not None and name == "late":
                 own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}
                 robot = with_fixed_ranges(robot, own, nominal=True)
-            env = env_of_policy(policy, count, conditions, change=change_task, modules=modules, robot=robot)
+            env = env_of_recipe(recipe, count, conditions, change=change_task, robot=robot)
             target = evaluation_of(env.task).finetune_target
             if target is None:
                 raise InputError(f"fine-tuning supports jumps to heights and positions, not {env.task.name}")
@@ -206,10 +207,12 @@ def finetune(
     `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """
     begin = time.perf_counter()
-    if cfg.robot is not None:  # environments are of the robot in the policy's configuration
-        env = policy.config.get("env", {}) | {"robot": load_overlay(cfg.robot).to_json()}
-        policy = Policy(policy.layers, policy.mean, policy.std, policy.interface, policy.config | {"env": env})
-    groups = make_groups(policy, cfg, modules)
+    recipe, config = policy.recipe(modules), policy.config
+    if cfg.robot is not None:
+        robot = load_overlay(cfg.robot)
+        recipe = replace(recipe, robot=robot)
+        config = config | {"env": config["env"] | {"robot": robot.to_json()}}
+    groups = make_groups(recipe, cfg)
     aims = []
     if not groups[0].to_height:
         with phase("correcting the aim", AIM_ROUNDS + 1) as advance:
@@ -222,5 +225,5 @@ def finetune(
     layers = network.layers(network.weights)
     settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite", "json")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}
-    config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
+    config = config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config), record

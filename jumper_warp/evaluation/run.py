@@ -20,8 +20,7 @@ from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.trained import trained_range
-from jumper_warp.policies.conditions import Conditions, env_of_policy
-from jumper_warp.policies.restore import restored_task
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
@@ -230,11 +229,12 @@ class EvaluationRun(Run):
         Raises PolicyError, also for an unknown evaluation, or CheckpointError.
         """
         super().__init__()
-        self.source, self.modules = source, list(modules)
+        self.source = source
         from jumper_warp.policies.runs import open_policy
 
         self.policy = open_policy(source)
-        self.task = restored_task(self.policy.config, self.modules)
+        self.recipe = self.policy.recipe(modules)
+        self.task = self.recipe.task
         self.evaluation = evaluation_of(self.task)
         self.settings = {"task": self.task.name, **trained_range(self.task)}
 
@@ -263,13 +263,13 @@ class EvaluationRun(Run):
         self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:  # fmt: skip
-        """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_policy`.
+        """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_recipe`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
         """
         change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
-        env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
+        env = env_of_recipe(self.recipe, count, conditions, change=change, **scene)
         self.policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
         self.settings["torque_limit_nm"] = torque_limit(env)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
-from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.recipe import Recipe
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
-from jumper_warp.tasks.saving import OPTIONAL
+from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
@@ -24,12 +23,11 @@ from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
-    from jumper_warp.policies.policy import Policy
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of a test: physics, randomisation, seed, and parameters with fixed values; see `env_of_policy`."""
+    """Conditions of a test: physics, randomisation, seed, and parameters with fixed values; see `env_of_recipe`."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
     randomize: bool = False  # Sample masses, friction, motors, latency and pushes as in training
@@ -80,21 +78,18 @@ class Conditions:
                   "sensor_offset": self.sensor_offset}  # fmt: skip
         return {name: value for name, value in values.items() if value is not None}
 
-    def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
-        """Return the robot overlay (values that differ from the description): from the file `robot`, else the policy's.
+    def overlay(self, trained: RobotOverlay | None) -> RobotOverlay | None:
+        """Return the robot overlay (values that differ from the description): from the file `robot`, else `trained`.
 
-        None: the described robot. config: `Policy.config`. Raises InputError or OSError: the overlay cannot be used.
+        None: the described robot. trained: of the training. Raises InputError or OSError: the file cannot be used.
         """
-        if self.robot is not None:
-            return load_overlay(self.robot)
-        saved = config.get("env", {}).get("robot")
-        return None if saved is None else RobotOverlay.from_json(saved)
+        return trained if self.robot is None else load_overlay(self.robot)
 
-    def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
+    def env_settings(self, trained: RobotOverlay | None) -> dict[str, Any]:
         """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         fixed = fixed_ranges(**self.fixed_parameters)
-        robot = with_fixed_ranges(self.overlay(config), fixed, nominal=not self.randomize)
+        robot = with_fixed_ranges(self.overlay(trained), fixed, nominal=not self.randomize)
         return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": robot}
 
     @property
@@ -123,41 +118,42 @@ class Conditions:
         return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
 
 
-def shared_config(configs: Mapping[str, dict[str, Any]], conditions: Conditions) -> dict[str, Any]:
-    """Return the configuration whose robot overlay (changed robot values) applies to several policies; {} if none.
+def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditions) -> RobotOverlay | None:
+    """Return the robot overlay (changed robot values) that applies to several policies; None: the described robot.
 
-    configs: `Policy.config` by name of the policy. One line on standard error names policies of the described robot
-    that get the overlay of another one. The overlay of `conditions` replaces all of these.
+    robots: overlays of the trainings by name of the policy. One line on standard error names policies of the described
+    robot that get the overlay of another one. The overlay of `conditions` replaces all of these.
     Raises PolicyError: policies were trained with different overlays.
     """
-    saved = {name: overlay for name, config in configs.items() if (overlay := config.get("env", {}).get("robot"))}
+    saved = {name: overlay.to_json() for name, overlay in robots.items() if overlay is not None}
     if conditions.robot is not None or not saved:
-        return {}
+        return None
     first, *others = saved
     for other in others:
-        if any(saved[other].get(key) != saved[first].get(key) for key in ("values", "randomization")):
+        if any(saved[other][key] != saved[first][key] for key in ("values", "randomization")):
             raise PolicyError(f"{first} and {other} were trained with different robots: choose one with --robot FILE")
-    if without := [name for name in configs if name not in saved]:
+    if without := [name for name in robots if name not in saved]:
         described = f"{' and '.join(without)} {'were' if len(without) > 1 else 'was'} trained without"
         print(f"jumper: the robot has the overlay of {first}; {described}", file=sys.stderr)
-    return configs[first]
+    return robots[first]
 
 
-def env_of_policy(
-    policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
-    modules: Iterable[ModuleType] = (), **scene: Any,
+def env_of_recipe(
+    recipe: Recipe, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    **scene: Any,
 ) -> Env:  # fmt: skip
-    """Return the environment of a policy's task in the given test conditions.
+    """Return the environment of a recipe's task in the given test conditions.
 
-    It has no rewards, no critic observation, and events only if randomised, so that functions of these may be missing.
-    policy: its configuration holds the task. change: returns a modified task before the conditions are applied.
-    modules: user modules in which the task's functions are looked up. scene: further arguments of `Env`.
-    Raises PolicyError: the task cannot be restored, or its observation differs from the policy's.
+    It has no rewards, no critic observation, and events only if randomised.
+    change: returns a modified task before the conditions are applied. scene: further arguments of `Env`.
+    Raises PolicyError: an event is needed, and its function was not found.
     """
     from jumper_warp.envs.env import Env
 
-    leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
-    task = task_of_policy(policy, modules, leave_out=leave_out)
+    try:
+        task = recipe.tested_task(conditions.randomize)
+    except TaskError as error:
+        raise PolicyError(str(error)) from error
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
-        return Env(task, num_envs, **conditions.env_settings(policy.config) | scene)
+        return Env(task, num_envs, **conditions.env_settings(recipe.robot) | scene)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.recipe import Recipe
 from jumper_warp.rl.mirror import Weights
 from jumper_warp.rl.networks import ACTIVATIONS, linear_layers
+from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.normalise import normalise
 
@@ -60,6 +63,20 @@ class Policy(nn.Module):
             if i < len(layers) - 1:
                 self.actor.append(ACTIVATIONS[interface.activation]())
         self.requires_grad_(False)
+
+    def recipe(self, modules: Iterable[ModuleType] = ()) -> Recipe:
+        """Return the recipe of the policy's training, from its configuration; see `Recipe.from_json`.
+
+        modules: the user's, in which functions from outside the project are looked up.
+        Raises PolicyError: the configuration has no recipe of this version, or its observation is another one.
+        """
+        try:
+            recipe = Recipe.from_json(self.config, modules, complete=False)
+        except TaskError as error:
+            raise PolicyError(str(error)) from error
+        if recipe.task.observation_names != self.interface.observation_names:
+            raise PolicyError("the policy's observation differs from that of its task in this version")
+        return recipe
 
     @property
     def layers(self) -> Weights:

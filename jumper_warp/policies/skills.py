@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.policies.conditions import Conditions, shared_config
-from jumper_warp.policies.restore import task_of_policy
+from jumper_warp.policies.conditions import Conditions, shared_robot
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.switching import skills_and_handovers
@@ -46,7 +45,8 @@ class SkillPolicies:
         self.names = SkillNames() if names is None else names
         self.sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in self.sources]
-        self.tasks = [task_of_policy(policy) for policy in self.policies]
+        self.recipes = [policy.recipe() for policy in self.policies]
+        self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
         suites = (("velocity",), ("apex_height",), ("landing_position", "omnidirectional"))
         for task, accepted in zip(self.tasks, suites, strict=True):
             if task.evaluation_suite not in accepted:
@@ -74,8 +74,8 @@ class SkillPolicies:
         from jumper_warp.envs.env import Env
 
         self.skills, self.handovers = self._skills_and_handovers(conditions)
-        configs = {source: policy.config for source, policy in zip(self.sources, self.policies, strict=True)}
-        settings = conditions.env_settings(shared_config(configs, conditions))
+        robots = {source: recipe.robot for source, recipe in zip(self.sources, self.recipes, strict=True)}
+        settings = conditions.env_settings(shared_robot(robots, conditions))
         env = Env(self.skills, count, skill=WALK, handovers=self.handovers, **settings, **scene)
         for policy in self.policies:
             policy.to(env.device)

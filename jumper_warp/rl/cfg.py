@@ -28,6 +28,8 @@ PPO_BOUNDS = {
 }  # fmt: skip
 """Smallest and largest value of settings of PPO, and unit."""
 LATEST, LATEST_OR_NEW = "latest", "latest-or-new"  # Values of `TrainCfg.resume` that are not paths
+SESSION = ("device", "threads", "log_root", "resume", "init_policy", "tensorboard", "wandb")
+"""Settings of `TrainCfg` that are not restored when a run is resumed."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW
+from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW, SESSION
 from jumper_warp.rl.checkpoint import (
     DECODE_ERRORS,
     MANIFEST,
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from jumper_warp.rl.distributed import Rank
 
 CHECKPOINTS = "checkpoints"  # Folder in a run's folder that holds its checkpoints
-SESSION = ("device", "threads", "log_root", "resume", "init_policy", "tensorboard", "wandb")
-"""Training settings that are not restored when a run is resumed."""
 DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's configuration that follow from other settings
 
 

@@ -17,13 +17,13 @@ from cli_helpers import curves, run
 from hold_height import hold_height
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
-from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
+from jumper_warp.cli.train import parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import load_policy, open_policy
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, WALKING, make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
@@ -227,7 +227,7 @@ def test_flag_sets_each_term_parameter(name):
 
 def parsed(task, args):
     """Return a copy of the task with settings changed by --env flags."""
-    return parse_settings(task, TrainArgs(), args)[1]
+    return parse_settings(Recipe(task), args)[1]
 
 
 def leaves(value, path=""):
@@ -283,7 +283,8 @@ def test_flags_set_training_and_task_settings():
         " --env.command-filter.sum.upper 200 --env.randomization.latency None --env.action-scale 10 80"
         " --env.contact-force 0.2 --env.reward-floor None --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
-    args, task = parse_train(["Olympus-Vertical-Jump", *flags.split()])
+    recipe, _ = parse_train(["Olympus-Vertical-Jump", *flags.split()])
+    task = recipe.task
     assert task.rewards[0].numbers == {"weight": 25.0, "std_fine": 0.2, "scale_sharp": 0.05, "std_wide": 0.4}
     assert {end.name: end.numbers for end in task.terminations}["wrong_height"] == {"tolerance": 0.07}
     seen = {term.name: term for term in task.observations.actor}
@@ -295,12 +296,12 @@ def test_flags_set_training_and_task_settings():
     assert task.motors.lateral.kp == 11.0 and task.command_filter.sum.upper == 200.0
     assert task.randomization.latency is None and task.action_scale == (10.0, 80.0)
     assert (task.contact_force, task.reward_floor) == (0.2, None)
-    assert args.cfg.ppo.gamma == 0.9 and args.cfg.task == "vertical-jump"
-    assert (args.solver, args.noise, args.randomize) == ("mujoco", False, True)
+    assert recipe.train.ppo.gamma == 0.9 and recipe.train.task == "vertical-jump"
+    assert (recipe.solver, recipe.noise, recipe.randomize) == ("mujoco", False, True)
 
 
 def test_history_flag_sets_history_of_noisy_observations():
-    _, task = parse_train(["vertical-jump", "--history", "2"])
+    task = parse_train(["vertical-jump", "--history", "2"])[0].task
     steps = {term.name: term.options["history"] for term in task.observations.actor}
     assert [steps[name] for name in ("lin_vel", "ang_vel", "gravity", "angle", "last_action")] == [2] * 5
     assert steps["wanted_height"] == steps["rate"] == 1
@@ -313,7 +314,7 @@ def test_flags_set_device_arrays():
     flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4"
     flags += " --env.observations.actor.lin-vel.noise 0.3"
     flags += " --env.reset.tilt 9 --env.levels.0.base-height 0.3 0.31 --env.contact-force 0.7 --env.action-scale 10 80"
-    _, task = parse_train(["vertical-jump", *flags.split()])
+    task = parse_train(["vertical-jump", *flags.split()])[0].task
     env = Env(task, 2, device="cpu", randomize=False)
     skill = env.skills[0]
     numbers = skill.params.values.numpy()
@@ -336,11 +337,11 @@ def test_flags_set_device_arrays():
     ],
 )
 def test_default_ppo_settings_depend_on_the_task(name, ppo):
-    assert parse_train([name])[0].cfg.ppo == ppo
+    assert parse_train([name])[0].train.ppo == ppo
 
 
 def test_default_best_checkpoint_metric_depends_on_the_task():
-    names = {name: parse_train([name])[0].cfg.best_metric for name in ("vertical-jump", "velocity-rough")}
+    names = {name: parse_train([name])[0].train.best_metric for name in ("vertical-jump", "velocity-rough")}
     assert names == {"vertical-jump": "Metrics/success", "velocity-rough": "Metrics/score"}
 
 
@@ -382,7 +383,7 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
     policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
     assert policy.interface == same.interface and policy.interface.sizes == (147, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
-    assert restored_task(policy.config).curriculum.numbers["promote_after"] == 2
+    assert policy.recipe().task.curriculum.numbers["promote_after"] == 2
     assert policy.config["train"]["num_envs"] == 16 and policy.config["iteration"] == 2
     assert (trained_run / "policy" / "learning_curve.jsonl").read_text().count("\n") >= 1
 

@@ -11,7 +11,7 @@ import jumper_warp
 from cli_helpers import run
 from jumper_warp.cli.flags import list_flags
 from jumper_warp.cli.main import parse, parse_error
-from jumper_warp.cli.train import SHORT_HELP, TrainArgs, parse_train, report_cpu_time
+from jumper_warp.cli.train import SHORT_HELP, parse_train, report_cpu_time
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
@@ -196,36 +196,36 @@ def test_usage_lists_exit_codes(capsys):
 
 
 @pytest.mark.parametrize(
-    ("args", "presets", "message"),
+    ("cfg", "preset", "presets", "message"),
     [
-        (TrainArgs(TrainCfg(threads=2)), (),
+        (TrainCfg(threads=2), False, (),
          "without a GPU this training takes about 10 h: 734.0 M steps at 20,000 steps/s\n"),
-        (TrainArgs(TrainCfg(threads=1)), ("laptop",),
+        (TrainCfg(threads=1), False, ("laptop",),
          "about 20 h: 734.0 M steps at 10,000 steps/s; settings for such a machine: --preset laptop\n"),
-        (TrainArgs(TrainCfg(threads=1, num_envs=1024, max_iterations=140), preset="laptop"), (),
+        (TrainCfg(threads=1, num_envs=1024, max_iterations=140), True, (),
          "about 8 min: 4.6 M steps at 10,000 steps/s\n"),
-        (TrainArgs(TrainCfg(threads=4, num_envs=1024, max_iterations=140), preset="laptop"), (),
+        (TrainCfg(threads=4, num_envs=1024, max_iterations=140), True, (),
          "about 4 min: 4.6 M steps at 20,000 steps/s\n"),
-        (TrainArgs(TrainCfg(threads=1, max_seconds=120.0)), ("a", "b"),
+        (TrainCfg(threads=1, max_seconds=120.0), False, ("a", "b"),
          "2 min; settings for such a machine: --preset a or --preset b\n"),
-        (TrainArgs(TrainCfg(threads=1, num_envs=64, max_iterations=2)), ("laptop",), ""),
+        (TrainCfg(threads=1, num_envs=64, max_iterations=2), False, ("laptop",), ""),
     ],
 )  # fmt: skip
-def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, args, presets, message):
-    report_cpu_time(args, presets)
+def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, cfg, preset, presets, message):
+    report_cpu_time(cfg, 0, preset, presets)
     err = capsys.readouterr().err
     assert err.endswith(message) and err.count("\n") == (1 if message else 0)
 
 
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
 def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, capsys):
-    parsed, made = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
-    assert (parsed.cfg.num_envs, parsed.randomize, parsed.noise) == (8, False, True)
+    recipe, _ = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
+    assert (recipe.train.num_envs, recipe.randomize, recipe.noise) == (8, False, True)
     line = capsys.readouterr().err
     assert line.startswith("preset laptop: --no-randomize --history 1 --ppo.hidden 128 64 64 --")
     assert "--num-envs" not in line and "--no-noise" not in line
-    assert parsed.cfg.ppo.hidden == (128, 64, 64) and parsed.cfg.ppo.desired_kl == 0.02
-    widths = [max(end for _, end in each.layout("actor").values()) for each in (made, make_task(task))]
+    assert recipe.train.ppo.hidden == (128, 64, 64) and recipe.train.ppo.desired_kl == 0.02
+    widths = [max(end for _, end in each.layout("actor").values()) for each in (recipe.task, make_task(task))]
     assert widths[0] < widths[1]  # one step of observations
 
 

@@ -4,11 +4,10 @@ import json
 import shutil
 
 import pytest
-import torch
 
 from cli_helpers import run as command
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.train import env_maker, parse_train
+from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import with_springs
@@ -80,23 +79,22 @@ def test_flags_override_saved_settings_and_print_each_change(capsys, run):
 
 
 def test_session_settings_are_not_restored(run):
-    args = parse_train(["vertical-jump", "--resume", str(run)])[0].cfg
+    args = parse_train(["vertical-jump", "--resume", str(run)])[0].train
     assert (args.device, args.tensorboard, args.threads, args.resume) == (None, True, None, str(run))
     assert (args.seed, args.save_interval, args.num_envs, args.max_iterations) == (3, 7, 4, 1)
 
 
 def test_robot_flag_overrides_the_robot_of_the_run(run, tmp_path):
     with_springs(700.0, 0.1).save(tmp_path / "stiffer.json")
-    overridden = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])
-    for (args, task), stiffness in ((parse_train(["vertical-jump", "--resume", str(run)]), 600.0), (overridden, 700.0)):
-        saved = env_maker(task, args)(2, 0, torch.device("cpu")).config()["robot"]
+    overridden = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])[0]
+    for recipe, stiffness in ((parse_train(["vertical-jump", "--resume", str(run)])[0], 600.0), (overridden, 700.0)):
+        saved = recipe.make_env(2, 0, "cpu").config()["robot"]
         assert saved["values"]["spring_stiffness"] == [stiffness]
 
 
 def test_solver_of_the_run_is_restored(run):
     resave(run, env={"solver": "SolverMuJoCo"})
-    args = parse_train(["vertical-jump", "--resume", str(run)])[0]
-    assert (args.solver, args.history) == ("mujoco", None)
+    assert parse_train(["vertical-jump", "--resume", str(run)])[0].solver == "mujoco"
     assert parse_train(["vertical-jump", "--resume", str(run), "--solver", "jumper"])[0].solver == "jumper"
 
 
@@ -112,8 +110,8 @@ def resave(run, train=None, env=None, lacks=()):
 
 def test_settings_missing_from_the_run_have_defaults(capsys, run):
     resave(run, lacks=("noise", "randomize"))
-    args, task = parse_train(["vertical-jump", "--resume", str(run)])
-    assert (args.noise, args.randomize, task.gravity) == (True, True, 3.71)
+    recipe, _ = parse_train(["vertical-jump", "--resume", str(run)])
+    assert (recipe.noise, recipe.randomize, recipe.task.gravity) == (True, True, 3.71)
     err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize")[2]
     assert changed_settings(err) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
 
@@ -153,7 +151,7 @@ def test_resume_without_value_exits_with_2(capsys):
 
 
 def test_new_training_has_default_task_settings():
-    assert parse_train(["vertical-jump"])[1] == make_task("vertical-jump")
+    assert parse_train(["vertical-jump"])[0].task == make_task("vertical-jump")
 
 
 def test_run_that_another_process_writes_is_refused(capsys, run):

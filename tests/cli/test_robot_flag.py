@@ -3,13 +3,12 @@
 import json
 
 import pytest
-import torch
 import tyro
 
 from jumper_warp.cli.main import main
-from jumper_warp.cli.train import env_maker, parse_train
+from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of, torque_limit
-from jumper_warp.policies.conditions import env_of_policy
+from jumper_warp.policies.conditions import env_of_recipe
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.output import read_values
@@ -48,7 +47,7 @@ def test_heavier_robot_jumps_less_high(overlay, tmp_path, command):
 def test_experiments_accept_the_robot_flag(overlay):
     args = tyro.cli(EvaluationArgs, args=["--robot", str(overlay), "--policy", "vertical_jump", "--device", "cpu"])
     masses = [
-        base_mass(env_of_policy(open_policy(args.policy), 1, conditions_of(a)))
+        base_mass(env_of_recipe(open_policy(args.policy).recipe(), 1, conditions_of(a)))
         for a in (args, EvaluationArgs(device="cpu"))
     ]
     assert masses[0] - masses[1] == pytest.approx(HEAVY, abs=1e-5)
@@ -58,7 +57,9 @@ def test_torque_limit_metric_includes_the_overlay(tmp_path):
     RobotOverlay({"saturation": 4 * (0.5, 0.9, 0.9)}).save(tmp_path / "weak.json")
     args = EvaluationArgs(robot=tmp_path / "weak.json", device="cpu")
     policy = open_policy("vertical_jump")
-    nominal, weak = (torque_limit(env_of_policy(policy, 1, conditions_of(a))) for a in (EvaluationArgs(), args))
+    nominal, weak = (
+        torque_limit(env_of_recipe(policy.recipe(), 1, conditions_of(a))) for a in (EvaluationArgs(), args)
+    )
     assert nominal == 18.0 and weak == pytest.approx(16.2)  # [N m], transversal motors: 0.9 · 18
 
 
@@ -74,8 +75,8 @@ def test_refuses_misspelt_overlay_and_names_the_file(command, change, tmp_path, 
 
 
 def test_training_uses_and_saves_the_overlay(overlay):
-    args, task = parse_train(["vertical-jump", "--robot", str(overlay), "--no-randomize"])
-    env = env_maker(task, args)(2, 0, torch.device("cpu"))
+    recipe, _ = parse_train(["vertical-jump", "--robot", str(overlay), "--no-randomize"])
+    env = recipe.make_env(2, 0, "cpu")
     saved = RobotOverlay.from_json(json.loads(json.dumps(env.config()))["robot"])
     assert base_mass(env) == pytest.approx(saved.values["base_mass"][0]) and saved.values["kp"][0] == 0.8
     assert saved.randomization == {"base_mass": (-0.1, 0.1)}

@@ -11,11 +11,10 @@ import pytest
 from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
-from jumper_warp.cli.train import check_saving, command_line
+from jumper_warp.cli.train import command_line
 from jumper_warp.kernels.jump import rewards
-from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import load_policy, open_policy
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
@@ -232,12 +231,12 @@ def test_play_with_randomization_refuses_missing_event_function(capsys, runs):
     assert code == 2 and "task.events[0] needs 'my_jumps:slow'" in err[-1]
 
 
-def test_restored_task_uses_the_users_reward_function(runs, path):
+def test_recipe_uses_the_users_reward_function(runs, path):
     config = open_policy(runs["tame-jump"]).config
-    with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:base_at_rest'"):
-        restored_task(config, leave_out=())
+    with pytest.raises(TaskError, match=r"task.rewards\[0\] needs 'my_jumps:base_at_rest'"):
+        Recipe.from_json(config, [])
     module = load_task_module(path)
-    task = restored_task(config, [module], leave_out=())
+    task = Recipe.from_json(config, [module]).task
     assert task.rewards[0].func is module.base_at_rest is not rewards.base_at_rest
     assert task == make_task("tame-jump").with_terms("rewards", base_at_rest={"height": 0.4})
 
@@ -290,9 +289,9 @@ def test_train_refuses_functions_that_cannot_be_saved(capsys, tmp_path):
 
 def test_registered_tasks_can_be_saved():
     for name in TASKS:
-        check_saving(make_task(name))
+        Recipe(make_task(name)).check_saving()
     with pytest.raises(TaskError):
-        check_saving(make_task("vertical-jump").with_terms("rewards", base_at_rest={"name": "a:b"}))
+        Recipe(make_task("vertical-jump").with_terms("rewards", base_at_rest={"name": "a:b"})).check_saving()
 
 
 @pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])

@@ -16,7 +16,7 @@ from columns import ANG_VEL, QUAT, XY, X, Y, Z
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.onnx import export_onnx
 from jumper_warp.policies.runs import load_policy
 from jumper_warp.robot.motors import jumping_motors
@@ -122,7 +122,7 @@ def test_interface_has_first_column_end_and_history_of_each_observation_term():
 def test_observations_actions_and_targets_agree_with_the_environment(name, goal, heading):
     """The environment's policy drives one robot through a jump, whose readings the deployed policy gets each step."""
     policy, deployed, command = load_policy(name), onnx_of(name), JumpCommand()
-    env = env_of_policy(policy, 1, Conditions(device="cpu"))
+    env = env_of_recipe(policy.recipe(), 1, Conditions(device="cpu"))
     env.evaluation_reset([[*goal, COMMAND_STEP]], heading)
     goal_position = env.task_arrays()["goal"][0, XY]
     errors, frame_difference = np.zeros(3), 0.0

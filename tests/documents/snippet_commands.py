@@ -12,13 +12,14 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import patch
 
-import jumper_warp.cli.play  # its saved_task is patched
+import jumper_warp.cli.play  # its open_run is patched
 import jumper_warp.cli.train  # noqa: F401
-from jumper_warp.cli.evaluate import saved_task
 from jumper_warp.cli.main import COMMANDS, main
 from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.errors import InputError
 
@@ -132,8 +133,8 @@ class Commands:
                     args = args[:at] + args[at + 2 :]
             result = parsed(lambda: main(args), "jumper_warp.cli.train.parse_train")
             if result is not None:
-                self.made["logs"] = self.task = result[1]
-                self.check_values(result[0])
+                self.made["logs"] = self.task = result[0].task
+                self.check_values(result[0].train)
             return
         if args[0] == "info" and "--task-module" in args:  # of a user's task
             self.require(Path(args[args.index("--task-module") + 1]))
@@ -143,7 +144,9 @@ class Commands:
             if args[0] in OPENED and args[1:] and args[1][0] != "-" and args[1:2] != ["robot"]:
                 task = self.task_of(args[1])
                 for module in ("evaluate", "play") if task else ():
-                    stack.enter_context(patch(f"jumper_warp.cli.{module}.saved_task", lambda *_: task))
+                    stack.enter_context(
+                        patch(f"jumper_warp.cli.{module}.open_run", lambda *_: SimpleNamespace(task=task))
+                    )
                 if task and args[0] not in ("evaluate", "play"):
                     args = [args[0], "vertical_jump", *args[2:]]
             settings = parsed(lambda: main(args)) if args[0] != "completion" else None
@@ -152,7 +155,7 @@ class Commands:
         if path := getattr(settings, "out", None) or default:
             policy = args[0] in ("finetune", "export") and args[1] != "robot"
             if policy and not task:  # that of a user's module is the last training's
-                task = self.task if "--task-module" in args else saved_task(args[1], [])
+                task = self.task if "--task-module" in args else open_policy(args[1]).recipe().task
             self.made[str(path)] = task
 
     def check_script(self, script, args):

@@ -74,7 +74,7 @@ def test_starts_in_flight_come_down_at_their_goal_on_mars():
 
 
 def test_gravity_is_a_flag_of_trainings_evaluations_and_experiments():
-    assert parse_train(["vertical-jump", "--env.gravity", "3.71"])[1].gravity == MARS
+    assert parse_train(["vertical-jump", "--env.gravity", "3.71"])[0].task.gravity == MARS
     assert tyro.cli(Conditions, args=["--gravity", "3.71"]).gravity == MARS
     assert conditions_of(tyro.cli(EvaluationArgs, args=["--gravity", "3.71"])).gravity == MARS
     assert Conditions(gravity=MARS).applied(make_task("velocity-flat")).gravity == MARS

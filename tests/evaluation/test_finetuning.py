@@ -11,7 +11,7 @@ from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import RobotOverlay
@@ -40,7 +40,7 @@ def aiming_high():
 
 def test_jump_errors_match_environment_with_and_without_derivatives():
     policy = open_policy("vertical_jump")
-    (group,) = make_groups(policy, FinetuneCfg(**FEW))
+    (group,) = make_groups(policy.recipe(), FinetuneCfg(**FEW))
     network = Network(policy)
     errors, plain = jump_errors(group, network, derivatives=True), jump_errors(group, network, derivatives=False)
     assert torch.equal(errors.value, plain.value)
@@ -57,7 +57,7 @@ def test_jump_errors_match_environment_with_and_without_derivatives():
 def test_errors_of_bases_that_rise_twice_are_those_of_the_evaluation():
     """The last robot's base rises again after every other robot has passed its apex, by 13.7 mm."""
     policy, count = open_policy("vertical_jump"), 64
-    _, group = make_groups(policy, FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=count, device="cpu"))
+    _, group = make_groups(policy.recipe(), FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=count, device="cpu"))
     errors = jump_errors(group, Network(policy), derivatives=False)
     jumps = JumpLog(group.commands[:, 2], group.env.task.termination_names)
     group.begin()
@@ -87,7 +87,7 @@ def test_finetuning_to_another_robot_keeps_its_overlay(tmp_path):
     assert policy.config["env"]["robot"] == overlay.to_json()
     before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
     assert after < 0.5 * before and before > 0.002  # [m]
-    env = env_of_policy(policy, 4, Conditions(device="cpu"))
+    env = env_of_recipe(policy.recipe(), 4, Conditions(device="cpu"))
     assert env.sim.model.body_mass.numpy()[0] == pytest.approx(7.43)
 
 
@@ -122,7 +122,7 @@ def test_finetune_command_refuses_a_folder_that_another_process_makes(tmp_path, 
 
 def test_landing_errors_on_mars_are_measured_at_rest():
     policy = open_policy("mars_horizontal_jump")
-    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
+    (group,) = make_groups(policy.recipe(), FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
     assert not group.to_height
     errors = jump_errors(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
@@ -134,8 +134,8 @@ def test_landing_errors_on_mars_are_measured_at_rest():
 def test_finetuning_and_evaluation_share_no_robot_and_no_delay(seed):
     policy = open_policy("vertical_jump")
     cfg = FinetuneCfg(**FEW | {"num_goals": 2, "num_randomized": 16, "seed": 0})
-    tuned = make_groups(policy, cfg)[-1].env
-    reported = env_of_policy(policy, 16, Conditions(randomize=True, noise=True, seed=seed, device="cpu"))
+    tuned = make_groups(policy.recipe(), cfg)[-1].env
+    reported = env_of_recipe(policy.recipe(), 16, Conditions(randomize=True, noise=True, seed=seed, device="cpu"))
     for env in (tuned, reported):
         env.evaluation_reset(np.tile([0.0, 0.0, 0.8], (16, 1)))
     masses = [env.parameters.body_mass.numpy().reshape(16, 1, -1) for env in (tuned, reported)]
@@ -160,7 +160,7 @@ def test_correct_aim_removes_constant_overshoot():
     """A policy that observes goals 40 mm too far misses by less than the original after the correction alone."""
     # 16 goals: with 8, a single jump that slips can outweigh the others, and no aim correction is chosen
     policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
-    untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
+    untouched = jump_errors(make_groups(policy.recipe(), cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
@@ -181,7 +181,7 @@ def test_refuses_invalid_settings(change):
 
 def test_refuses_policies_that_do_not_jump():
     with pytest.raises(InputError, match="not velocity-flat"):
-        make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
+        make_groups(open_policy("walking_flat").recipe(), FinetuneCfg(**FEW))
 
 
 def test_refuses_zero_iterations_for_height_policies():

@@ -11,7 +11,7 @@ from columns import Z
 from experiments import departures
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.jumps import TERMINATIONS, jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.runs import load_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_from_json, task_to_json
@@ -23,44 +23,45 @@ from support.departures import DEPARTURES, ablation_flags
 
 
 def train_settings(task, name):
-    """Return the parsed settings of a training of `task` without the departure `name`, and the changed task."""
+    """Return the recipe of a training of `task` without the departure `name`."""
     ablation = DEPARTURES[task][name]
     return parse(ablation, departures.Args(task=task).command(ablation, 1, Path("logs")))
 
 
 @pytest.mark.parametrize("task", DEPARTURES)
 def test_ablation_functions_change_task(task):
-    plain = parse_train([task])[1]
+    plain = parse_train([task])[0].task
     for name, each in DEPARTURES[task].items():
         assert ablation_flags(each) or each(plain) != plain, name
 
 
 @pytest.mark.parametrize("task", ["vertical-jump", "horizontal-jump"])
 def test_ablation_flags_are_valid_and_change_task(task):
-    plain = parse_train([task])[1]
+    plain = parse_train([task])[0].task
     flags = " ".join(ablation_flags(each) for each in DEPARTURES[task].values())
-    parsed, changed = parse_train([task, *flags.split()])
+    recipe, _ = parse_train([task, *flags.split()])
+    changed = recipe.task
     assert task_from_json(json.loads(json.dumps(task_to_json(changed)))) == changed
     assert {"reset", "rewards", "terminations"} <= {
         key for key, part in vars(changed).items() if part != vars(plain)[key]
     }
     given = [word for word in flags.split() if word.startswith("--")]
-    assert len(set(given)) == len(given) and parsed.cfg.task == task
+    assert len(set(given)) == len(given) and recipe.train.task == task
 
 
 def test_ablation_functions_change_only_their_departure():
-    plain, changed = parse_train(["vertical-jump"])[1], train_settings("vertical-jump", "jumping_early")[1]
+    plain, changed = parse_train(["vertical-jump"])[0].task, train_settings("vertical-jump", "jumping_early").task
     names = [term.name for term in plain.terminations]
     assert [term.name for term in changed.terminations] == [name for name in names if name != "early_takeoff"]
     assert replace(changed, terminations=plain.terminations) == plain
-    heights = train_settings("vertical-jump", "goals")[1].levels
+    heights = train_settings("vertical-jump", "goals").task.levels
     assert [(level.goal_lower[2], level.goal_upper[2]) for level in heights] == [(0.6, 0.75), (0.6, 0.9), (0.6, 1.1)]
     assert {level.base_height for level in heights} == {(0.22, 0.45)}
-    places = train_settings("horizontal-jump", "goals")[1].levels
+    places = train_settings("horizontal-jump", "goals").task.levels
     assert [level.goal_upper for level in places[::2]] == [(0.55, 0, 0), (0.7, 0.1, 0), (0.85, 0.2, 0), (1.0, 0.3, 0)]
     assert [level.base_height for level in places] == 4 * [(0.22, 0.35), (0.22, 0.45)]
     assert {level.goal_lower[0] for level in places} == {0.4}
-    again = train_settings("horizontal-jump", "another_goal")[1].levels
+    again = train_settings("horizontal-jump", "another_goal").task.levels
     assert {level.next_jump_probability for level in again} == {0.0}
 
 
@@ -70,14 +71,15 @@ def test_ablations_of_mars_and_omnidirectional_jumps_have_levels_and_limits_of_t
         (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
     ]  # fmt: skip
     assert {(level.goal_lower[1], level.goal_upper[1]) for level in goals} == {(-0.3, 0.3)} and len(goals) == 8
-    parsed, limits = train_settings("horizontal-jump-mars-loose", "limits")
+    recipe = train_settings("horizontal-jump-mars-loose", "limits")
+    limits = recipe.task
     ends = {term.name: term.numbers for term in limits.terminations}
-    assert parsed.cfg.init_policy == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
+    assert recipe.train.init_policy == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
     assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
     earth, plain = make_task("horizontal-jump"), make_task("omnidirectional-jump")
     (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")
     assert ends["turned_touchdown"] == pytest.approx(touchdown, abs=1e-4)
-    assert train_settings("horizontal-jump-mars-loose", "wide_kernels")[1].rewards == earth.rewards
+    assert train_settings("horizontal-jump-mars-loose", "wide_kernels").task.rewards == earth.rewards
     around = DEPARTURES["omnidirectional-jump"]["reaches"](plain).levels
     assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
     assert around[0] == plain.levels[0]
@@ -86,7 +88,7 @@ def test_ablations_of_mars_and_omnidirectional_jumps_have_levels_and_limits_of_t
 @pytest.mark.parametrize("randomize", [False, True])
 def test_paws_penetrate_the_ground_by_less_than_a_millimetre(randomize):
     policy = load_policy("vertical_jump")
-    env = env_of_policy(policy, 20, Conditions(randomize=randomize, noise=randomize, device="cpu"))
+    env = env_of_recipe(policy.recipe(), 20, Conditions(randomize=randomize, noise=randomize, device="cpu"))
     goals = np.zeros((20, 3))
     goals[:, Z] = np.linspace(0.5, 1.05, 20)
     env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt))

@@ -14,7 +14,7 @@ from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
@@ -131,7 +131,9 @@ class OpenLoopPolicy:
 @pytest.fixture(scope="module")
 def sweep_env():
     """Return an environment of three nominal robots with the terminations of the sweep."""
-    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_jump_terminations)
+    return env_of_recipe(
+        still_policy("vertical-jump").recipe(), 3, Conditions(device="cpu"), change=with_jump_terminations
+    )
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])

@@ -23,7 +23,7 @@ from jumper_warp.evaluation.suites import (
     running_positions,
 )
 from jumper_warp.evaluation.sweeps import DistanceSweep
-from jumper_warp.policies.conditions import Conditions, env_of_policy
+from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
@@ -236,7 +236,7 @@ def hops():
     def change(task):
         return dataclasses.replace(task, terminations=tuple(term for term in task.terminations if term.name in ends))
 
-    env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
+    env = env_of_recipe(policy.recipe(), 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
     landings = JumpLog(
         goals, env.task.termination_names, headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])

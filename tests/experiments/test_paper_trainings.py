@@ -20,7 +20,7 @@ JUMPS = ["vertical-jump-paper", "horizontal-jump-paper", "vertical-jump"]
 
 def changed_task(name, arm):
     """Return the task that the flags of an arm make."""
-    return parse_train([name, *arm_flags(make_task(name), arm)])[1]
+    return parse_train([name, *arm_flags(make_task(name), arm)])[0].task
 
 
 @pytest.mark.parametrize("name", JUMPS)

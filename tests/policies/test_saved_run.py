@@ -6,12 +6,12 @@ import pytest
 
 import hold_height
 from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.jump.cfg import GroundCfg
-from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.tasks.saving import TaskError, task_to_json
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 
 SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}  # [s], [s], widths
@@ -68,13 +68,18 @@ def saved():
 
 def whole(config):
     """Return the task in a configuration with all sections."""
-    return restored_task(config, leave_out=())
+    return Recipe.from_json(config, []).task
+
+
+def nominal(config):
+    """Return the task in a configuration for a nominal test."""
+    return Recipe.from_json(config, [], complete=False).tested_task(randomize=False)
 
 
 def test_restored_task_equals_the_saved_one(saved):
     task, config = saved
     assert whole(config) == task != make_task("vertical-jump")
-    assert restored_task(config) == dataclasses.replace(
+    assert nominal(config) == dataclasses.replace(
         task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
     )
 
@@ -88,9 +93,9 @@ def test_missing_setting_gets_its_default(saved):
 def test_refuses_an_unknown_reward_unless_rewards_are_left_out(saved):
     _, config = saved
     config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
-    with pytest.raises(PolicyError, match=r"task.rewards\[23\] needs 'mine:my_own': pass the file"):
+    with pytest.raises(TaskError, match=r"task.rewards\[23\] needs 'mine:my_own': pass the file"):
         whole(config)
-    assert restored_task(config).name == "vertical-jump"
+    assert nominal(config).name == "vertical-jump"
 
 
 def test_restores_a_reward_outside_the_default_task(saved):
@@ -131,8 +136,8 @@ def test_restores_ground_randomisation_with_none_as_default(saved):
 def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):
     _, config = saved
     config["env"]["task"]["terminations"][1]["func"] = f"{prefix}{name}" if prefix else name
-    with pytest.raises(PolicyError, match=r"task.terminations\[1\]"):
-        restored_task(config)
+    with pytest.raises(TaskError, match=r"task.terminations\[1\]"):
+        nominal(config)
 
 
 @pytest.mark.parametrize(
@@ -157,19 +162,19 @@ def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):
 def test_refuses_an_invalid_task_configuration(saved, change, message):
     _, config = saved
     change(config["env"]["task"])
-    with pytest.raises(PolicyError, match=message):
-        restored_task(config)
+    with pytest.raises(TaskError, match=message):
+        nominal(config)
 
 
 def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
     for version in (3, 5):  # the present one is 4
         config["env"]["task"]["version"] = version
-        with pytest.raises(PolicyError, match=f"has version {version}, expected version 4; commit 05fa856"):
-            restored_task(config)
+        with pytest.raises(TaskError, match=f"has version {version}, expected version 4; commit 05fa856"):
+            nominal(config)
 
 
 @pytest.mark.parametrize("config", [{}, {"env": {}}, {"env": None}, {"env": {"task": 3}}, {"env": {"task": []}}])
 def test_refuses_a_configuration_without_a_task(config):
-    with pytest.raises(PolicyError, match="task"):
-        restored_task(config)
+    with pytest.raises(TaskError, match=r"task|configuration"):
+        nominal(config)

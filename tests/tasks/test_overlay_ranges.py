@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from jumper_warp.cli.train import env_maker, parse_train
+from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
@@ -200,8 +199,8 @@ def overlay_file(tmp_path):
 
 def trained_env(file, *flags, count=64):
     """Return the environment of a training of the robot in an overlay file."""
-    args, task = parse_train(["vertical-jump", "--robot", str(file), *flags])
-    env = env_maker(task, args)(count, 0, torch.device("cpu"))
+    recipe, _ = parse_train(["vertical-jump", "--robot", str(file), *flags])
+    env = recipe.make_env(count, 0, "cpu")
     env.reset()
     return env
 
