@@ -62,13 +62,13 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 
 def read_metrics(folder: Path) -> dict[str, MetricValue]:
     """Read the metrics in a run's `metrics.json`, by key."""
-    entries = json.loads((folder / "metrics.json").read_text())["metrics"]
+    entries = json.loads((folder / "metrics.json").read_bytes())["metrics"]
     return {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries.items()}
 
 
 def read_values(folder: Path) -> dict[str, Any]:
     """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
-    conditions = json.loads((folder / "metrics.json").read_text())["conditions"]
+    conditions = json.loads((folder / "metrics.json").read_bytes())["conditions"]
     return conditions | {key: metric.value for key, metric in read_metrics(folder).items()}
 
 

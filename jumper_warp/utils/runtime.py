@@ -15,6 +15,7 @@ from rich.console import Console
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import shown
+from jumper_warp.utils.startup import open_standard_streams
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
 
@@ -94,6 +95,7 @@ def init_warp() -> None:
     A log level that the user has set is kept. A terminal shows when kernels are compiled. Warp's native library prints
     the notice about the driver, so that the process's standard error is a file meanwhile.
     """
+    open_standard_streams()
     if wp.config.log_level == wp.LOG_INFO:  # Warp's default
         wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()
@@ -133,7 +135,8 @@ def _package_commit() -> Commit | None:
 def _git(folder: Path, *arguments: str) -> str | None:
     """Return git's standard output for the tree in `folder`, or None if it fails or is not installed."""
     try:
-        result = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30)
+        settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 30}
+        result = subprocess.run(["git", "-C", str(folder), *arguments], **settings)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return result.stdout if result.returncode == 0 else None

@@ -45,13 +45,13 @@ def print_summary(
     """
     flags, paper, path = flags or PrintFlags(), paper or {}, folder / "metrics.json"
     if flags.json:
-        print(path.read_text(), end="")
+        print(path.read_text(encoding="utf-8"), end="")
         return
     metrics = read_metrics(folder)
     main = {key: metrics[key] for key in keys if key in metrics}
     print(textwrap.fill(title, WIDTH))
     if flags.verbose:
-        print_metrics(metrics, paper, json.loads(path.read_text())["conditions"])
+        print_metrics(metrics, paper, json.loads(path.read_bytes())["conditions"])
     elif main:
         table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
         print_table(table)

@@ -607,6 +607,29 @@ def test_closed_output_pipe_exits_with_0(args):
     assert_quiet_on_closed_pipe(f"from jumper_warp.cli.main import main; main({args})")
 
 
+def redirected(redirection, *args, **environment):
+    """Return the finished process of a command whose streams a shell has redirected."""
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", *args]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_exit_with_0(redirection):
+    done = redirected(redirection, "list")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("args", [["list"], ["train", "vertical-jump", "--help"]], ids=" ".join)
+def test_full_disk_under_the_output_is_one_line(args):
+    done = redirected(">/dev/full", *args)
+    assert (done.returncode, done.stderr) == (2, "jumper: standard output: No space left on device\n")
+
+
+def test_characters_that_the_terminal_lacks_are_printed_as_escapes():
+    done = redirected("", "train", "vertical-jump", "--help-all", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0 and r"\u03bb of generalised advantage" in done.stdout
+
+
 @pytest.mark.parametrize("flags", [{}, {"verbose": True}, {"json": True}], ids=str)
 def test_summary_on_a_closed_output_pipe_exits_with_0(tmp_path, flags):
     write_metrics(tmp_path, {"apex_m": 1.0})
