@@ -1,6 +1,9 @@
 """`jumper doctor`: its text and JSON, and the exit code where a device fails."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 import warp as wp
@@ -70,3 +73,32 @@ def test_missing_opengl_is_reported_without_a_fault(monkeypatch):
 
     monkeypatch.setattr("jumper_warp.viz.renderer.opengl_name", refuse)
     assert doctor.opengl() == {"name": None, "error": "ImportError: no pyglet"}
+
+
+NO_CACHE = "(Not a directory): set WARP_CACHE_PATH to a writable folder"
+
+
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [({"HOME": "/dev/null"}, "/dev/null/.cache/warp"), ({"WARP_CACHE_PATH": "/dev/null/kernels"}, "/dev/null/kernels")],
+)
+def test_kernel_cache_that_cannot_be_made_is_named(variables, folder):
+    environment = {key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    command, environment = [sys.executable, "-m", "jumper_warp", "doctor"], environment | variables
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    message = f"jumper: kernel cache {folder}/{wp.config.version} cannot be written {NO_CACHE}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", message)
+
+
+def test_kernel_cache_that_cannot_be_written_later_is_named(tmp_path):
+    file = tmp_path / "kernels.py"
+    file.write_text(
+        "import warp as wp\nfrom jumper_warp.utils.runtime import init_warp\n"
+        "@wp.kernel\ndef square(x: wp.array[float]):\n    x[0] *= x[0]\n"
+        "init_warp()\nwp.config.kernel_cache_dir = '/dev/null/kernels'\n"
+        "wp.launch(square, 1, [wp.zeros(1, dtype=float, device='cpu')], device='cpu')\n"
+    )
+    done = subprocess.run([sys.executable, str(file)], capture_output=True, text=True)
+    assert done.returncode == 1
+    line = f"jumper_warp.utils.errors.InputError: kernel cache /dev/null/kernels cannot be written {NO_CACHE}"
+    assert done.stderr.splitlines()[-1] == line
