@@ -19,6 +19,7 @@ from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.warm_start import actor_init_from_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.rl.run_names import newest
 from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
@@ -76,13 +77,14 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     arguments: of `jumper train`. Raises InputError: the existing training has other settings.
     """
     (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.max_iterations)}")):
-        config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
+    last = name.format(parsed.cfg.max_iterations)
+    if run := newest(path.parents[1] for path in Path(parsed.cfg.log_root).glob(f"*/*/{last}")):
+        config = json.loads((run / CONFIG).read_text())
         requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
         changed = {key for key in requested.keys() - NOT_COMPARED if requested[key] != config["train"].get(key)}
         if changed or config["env"]["task"] != task_to_json(task):
-            raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
-        return checkpoints[-1]
+            raise InputError(f"{run} was trained with other settings: choose another --out")
+        return run / last
     start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
     command = shlex.join(["jumper", "train", *arguments])
     result = train(parsed.cfg, env_maker(task, parsed), command, actor_init=start)

@@ -388,10 +388,11 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
 
 
 def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, capsys):
-    old, new = tmp_path / "logs" / "jump" / "2026-01-01", tmp_path / "logs" / "jump" / "2026-01-02"
+    names = ("2026-01-01_00-30-00_000001+0100", "2025-12-31_19-30-00_000000-0500", "2026-01-03_00-00-00_000000+0100")
+    old, new, empty = (tmp_path / "logs" / "jump" / name for name in names)  # half past midnight in New York is later
     for folder in (old, new):
         shutil.copytree(trained_run / "checkpoints", folder / "checkpoints")
-    (tmp_path / "logs" / "jump" / "2026-01-03" / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
+    (empty / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
     code, out, err = run(capsys, "export", str(new.parent))
     assert (code, out, err) == (0, f"{new / 'policy'}\n", [f"{new}: best checkpoint, iteration 2"])
     assert open_policy(old.parent).interface == load_policy(new / "policy").interface
