@@ -20,6 +20,7 @@ from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG
+from jumper_warp.rl.run_names import newest
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.plots import figure
@@ -75,14 +76,15 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     arguments: of `jumper train`. Raises InputError: the existing training has other settings.
     """
     recipe, name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if checkpoints := sorted(recipe.train.log_root.glob(f"*/*/{name.format(recipe.train.max_iterations)}")):
-        config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
+    last = name.format(recipe.train.max_iterations)
+    if run := newest(path.parents[1] for path in recipe.train.log_root.glob(f"*/*/{last}")):
+        config = json.loads((run / CONFIG).read_text())
         requested = recipe.to_json()
         train_settings = requested["train"]
         changed = [k for k in train_settings.keys() - NOT_COMPARED if train_settings[k] != config["train"].get(k)]
         if changed or config["env"]["task"] != requested["env"]["task"]:
-            raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
-        return checkpoints[-1]
+            raise InputError(f"{run} was trained with other settings: choose another --out")
+        return run / last
     result = train(recipe, command=shlex.join(["jumper", "train", *arguments]))
     return result.folder / name.format(result.iteration)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import importlib
 import inspect
 import io
@@ -19,7 +20,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
-from jumper_warp.utils.startup import prepare_imports
+from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
 if TYPE_CHECKING:
@@ -195,9 +196,13 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
 def run_command(command: Callable[[], object]) -> None:
     """Call a command or an experiment; exits with code 2 and one line on standard error if its input is invalid.
 
-    InputError, and OSError about a file, are printed as one line; so is exhausted memory, with code 1; a closed output
-    pipe ends the command quietly with code 0; any other exception propagates.
+    InputError, and OSError about a file or a full disk, are printed as one line; so is exhausted memory, with code 1; a
+    closed output pipe ends the command quietly with code 0; any other exception propagates. Characters that the
+    encoding of standard output lacks are printed as escapes.
     """
+    open_standard_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             command()
@@ -209,11 +214,16 @@ def run_command(command: Callable[[], object]) -> None:
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (InputError, OSError) as error:
-        if isinstance(error, OSError) and error.filename is None:
+        discard_output()
+    except InputError as error:
+        print_error(str(error))
+        raise SystemExit(USAGE_ERROR) from None
+    except OSError as error:
+        if error.filename is None and error.errno != errno.ENOSPC:
             raise
-        print_error(f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
+        if error.filename is None:
+            discard_output()
+        print_error(f"{error.filename or 'standard output'}: {error.strerror}")
         raise SystemExit(USAGE_ERROR) from None
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -223,6 +233,11 @@ def run_command(command: Callable[[], object]) -> None:
         notes = reversed(getattr(error, "__notes__", ["use fewer worlds"]))
         print_error("; ".join([reason, *notes]))
         raise SystemExit(FAULT) from None
+
+
+def discard_output() -> None:
+    """Redirect standard output to the null device, also what is buffered: Python would fail to write it at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def print_error(message: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import read_file, read_json
@@ -95,7 +96,7 @@ def newest_run(source: str | Path) -> str | Path:
     path = Path(source)
     if _own_policy(path) or not path.is_dir():
         return source
-    return max(filter(is_run_folder, path.glob("*")), default=source)
+    return newest(filter(is_run_folder, path.glob("*"))) or source
 
 
 def _no_policy(text: str, path: Path) -> str:

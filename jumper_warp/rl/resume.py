@@ -19,6 +19,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     newest_name,
 )
+from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
@@ -37,9 +38,8 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
         return None
     if cfg.resume in (LATEST, LATEST_OR_NEW):
         runs = cfg.log_root / cfg.task
-        folders = sorted(path.parent for path in runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}"))
-        if folders:
-            return latest_checkpoint(folders[-1])
+        if run := newest(path.parents[1] for path in runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}")):
+            return latest_checkpoint(run / CHECKPOINTS)
         if cfg.resume == LATEST_OR_NEW:
             return None
         raise CheckpointError(f"{runs}: no run to resume")

@@ -6,13 +6,13 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterable
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.distributed import Rank, all_reduce_max
+from jumper_warp.rl.run_names import run_name
 from jumper_warp.utils.dumps import DUMPS, NonFiniteValue, write_dump
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
@@ -24,8 +24,7 @@ CONFIG = "config.json"  # File in a run's folder with all settings, versions and
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     """Create the folder of a new training run, log_root/task/time, on rank 0, and return its path on all ranks."""
     (microseconds,) = all_reduce_max([time.time_ns() // 1000 if rank.index == 0 else 0])
-    started = datetime.fromtimestamp(microseconds // 1_000_000).replace(microsecond=microseconds % 1_000_000)
-    folder = cfg.log_root / cfg.task / started.strftime("%Y-%m-%d_%H-%M-%S_%f")
+    folder = cfg.log_root / cfg.task / run_name(microseconds)
     if rank.index == 0:
         folder.mkdir(parents=True)
     return folder

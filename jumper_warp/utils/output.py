@@ -1,9 +1,11 @@
 """Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
+import itertools
 import json
 import math
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,11 +55,11 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder, repeat = Path("outputs", name, stamp), 1
-    while folder.exists():
-        repeat += 1
-        folder = folder.with_name(f"{stamp}_{repeat}")
-    folder.mkdir(parents=True)
+    for repeat in itertools.count(1):
+        folder = Path("outputs", name, stamp if repeat == 1 else f"{stamp}_{repeat}")
+        with suppress(FileExistsError):  # of this process, or of another one that has just made it
+            folder.mkdir(parents=True)
+            break
     return folder
 
 
@@ -81,7 +83,7 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 def read_report(folder: Path) -> Report:
     """Read the metrics and conditions of a run from its `metrics.json`."""
     path = folder / "metrics.json"
-    document = json.loads(path.read_text())
+    document = json.loads(path.read_bytes())
     entries = document["metrics"].items()
     metrics = {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries}
     return Report(path, document["conditions"], metrics)

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
 from rich.text import Text
 
+from jumper_warp.utils.startup import open_standard_streams
+
 P = ParamSpec("P")
 T = TypeVar("T")
 _shown: Progress | None = None  # Display of the outermost phase, which shows the phases within it too
@@ -44,6 +46,7 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
     that have been done since the last call. Phases may be nested. The display disappears at the end.
     """
     global _shown
+    open_standard_streams()
     if not sys.stderr.isatty() or os.environ.get("RANK", "0") != "0":
         yield lambda parts=1: None
         return

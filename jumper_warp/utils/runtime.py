@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
@@ -15,6 +17,7 @@ from rich.console import Console
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import shown
+from jumper_warp.utils.startup import open_standard_streams
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
 
@@ -93,7 +96,9 @@ def init_warp() -> None:
 
     A log level that the user has set is kept. A terminal shows when kernels are compiled. Warp's native library prints
     the notice about the driver, so that the process's standard error is a file meanwhile.
+    Raises InputError, also a later compilation: the kernel cache cannot be written.
     """
+    open_standard_streams()
     if wp.config.log_level == wp.LOG_INFO:  # Warp's default
         wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()
@@ -101,7 +106,8 @@ def init_warp() -> None:
         stderr = os.dup(2)
         os.dup2(printed.fileno(), 2)
         try:
-            wp.init()
+            with _kernel_cache():
+                wp.init()
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)
@@ -109,7 +115,17 @@ def init_warp() -> None:
             lines = [line for line in printed.read().decode(errors="replace").splitlines() if NO_DRIVER not in line]
             print("".join(f"{line}\n" for line in lines), end="", file=sys.stderr)
     compiler = "_compile"  # method of Warp 1.19 that is called only for a module that is not in the cache
-    setattr(wp.Module, compiler, shown("compiling kernels", getattr(wp.Module, compiler)))
+    setattr(wp.Module, compiler, shown("compiling kernels", _kernel_cache()(getattr(wp.Module, compiler))))
+
+
+@contextmanager
+def _kernel_cache() -> Iterator[None]:
+    """Raise InputError in place of an OSError of Warp about its kernel cache, for a block or a decorated function."""
+    try:
+        yield
+    except OSError as error:
+        folder = f"kernel cache {wp.config.kernel_cache_dir} cannot be written"
+        raise InputError(f"{folder} ({error.strerror}): set WARP_CACHE_PATH to a writable folder") from error
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
@@ -133,7 +149,8 @@ def _package_commit() -> Commit | None:
 def _git(folder: Path, *arguments: str) -> str | None:
     """Return git's standard output for the tree in `folder`, or None if it fails or is not installed."""
     try:
-        result = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30)
+        settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 30}
+        result = subprocess.run(["git", "-C", str(folder), *arguments], **settings)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return result.stdout if result.returncode == 0 else None

@@ -1,9 +1,10 @@
-"""Faster start and end of a command: fewer garbage collections, and imports of Newton's unused parts deferred."""
+"""Start and end of a command: open standard streams, few garbage collections, Newton's unused parts not imported."""
 
 from __future__ import annotations
 
 import atexit
 import gc
+import os
 import sys
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
@@ -68,6 +69,20 @@ class DeferredFinder(MetaPathFinder):
         if spec is not None and spec.loader is not None:
             spec.loader = DeferredLoader(spec.loader)
         return spec
+
+
+def open_standard_streams() -> None:
+    """Open standard streams that are closed, as by `>&-`, on the null device.
+
+    Otherwise the next opened file gets the number of such a stream, and the output of libraries.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # gets the lowest free number, this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
 def prepare_imports() -> None:

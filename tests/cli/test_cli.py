@@ -389,10 +389,11 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
 
 
 def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, capsys):
-    old, new = tmp_path / "logs" / "jump" / "2026-01-01", tmp_path / "logs" / "jump" / "2026-01-02"
+    names = ("2026-01-01_00-30-00_000001+0100", "2025-12-31_19-30-00_000000-0500", "2026-01-03_00-00-00_000000+0100")
+    old, new, empty = (tmp_path / "logs" / "jump" / name for name in names)  # half past midnight in New York is later
     for folder in (old, new):
         shutil.copytree(trained_run / "checkpoints", folder / "checkpoints")
-    (tmp_path / "logs" / "jump" / "2026-01-03" / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
+    (empty / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
     code, out, err = run(capsys, "export", str(new.parent))
     assert (code, out, err) == (0, f"{new / 'policy'}\n", [f"{new}: best checkpoint, iteration 2"])
     assert open_policy(old.parent).interface == load_policy(new / "policy").interface
@@ -606,6 +607,29 @@ def test_viewer_binds_to_loopback(tmp_path):
 )
 def test_closed_output_pipe_exits_with_0(args):
     assert_quiet_on_closed_pipe(f"from jumper_warp.cli.main import main; main({args})")
+
+
+def redirected(redirection, *args, **environment):
+    """Return the finished process of a command whose streams a shell has redirected."""
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", *args]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_exit_with_0(redirection):
+    done = redirected(redirection, "list")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("args", [["list"], ["train", "vertical-jump", "--help"]], ids=" ".join)
+def test_full_disk_under_the_output_is_one_line(args):
+    done = redirected(">/dev/full", *args)
+    assert (done.returncode, done.stderr) == (2, "jumper: standard output: No space left on device\n")
+
+
+def test_characters_that_the_terminal_lacks_are_printed_as_escapes():
+    done = redirected("", "train", "vertical-jump", "--help-all", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0 and r"\u03bb of generalised advantage" in done.stdout
 
 
 @pytest.mark.parametrize("flags", [{}, {"verbose": True}, {"json": True}], ids=str)

@@ -1,5 +1,9 @@
 """`jumper doctor`: its text, and the exit code where a device fails."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 import warp as wp
@@ -29,3 +33,32 @@ def test_device_that_fails_is_reported_and_the_exit_code_is_1(capsys, monkeypatc
     code, out, err = run(capsys, "doctor")
     rows = dict(line.split(None, 1) for line in out.splitlines())
     assert (code, err) == (1, []) and rows["cpu"] == "FAILED: RuntimeError: no kernel image is available"
+
+
+NO_CACHE = "(Not a directory): set WARP_CACHE_PATH to a writable folder"
+
+
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [({"HOME": "/dev/null"}, "/dev/null/.cache/warp"), ({"WARP_CACHE_PATH": "/dev/null/kernels"}, "/dev/null/kernels")],
+)
+def test_kernel_cache_that_cannot_be_made_is_named(variables, folder):
+    environment = {key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    command, environment = [sys.executable, "-m", "jumper_warp", "doctor"], environment | variables
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    message = f"jumper: kernel cache {folder}/{wp.config.version} cannot be written {NO_CACHE}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", message)
+
+
+def test_kernel_cache_that_cannot_be_written_later_is_named(tmp_path):
+    file = tmp_path / "kernels.py"
+    file.write_text(
+        "import warp as wp\nfrom jumper_warp.utils.runtime import init_warp\n"
+        "@wp.kernel\ndef square(x: wp.array[float]):\n    x[0] *= x[0]\n"
+        "init_warp()\nwp.config.kernel_cache_dir = '/dev/null/kernels'\n"
+        "wp.launch(square, 1, [wp.zeros(1, dtype=float, device='cpu')], device='cpu')\n"
+    )
+    done = subprocess.run([sys.executable, str(file)], capture_output=True, text=True)
+    assert done.returncode == 1
+    line = f"jumper_warp.utils.errors.InputError: kernel cache /dev/null/kernels cannot be written {NO_CACHE}"
+    assert done.stderr.splitlines()[-1] == line

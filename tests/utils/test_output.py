@@ -28,6 +28,19 @@ def test_two_runs_never_share_a_default_folder(tmp_path, monkeypatch):
     assert len({output.output_dir("jump") for _ in range(3)}) == 3
 
 
+def test_folder_that_another_process_makes_at_the_same_time_is_not_shared(tmp_path, monkeypatch):
+    make = Path.mkdir
+
+    def make_second(self, **settings):
+        if self.name.count("_") == 1:  # date_time, without a number
+            os.makedirs(self, exist_ok=True)
+        make(self, **settings)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Path, "mkdir", make_second)
+    assert output.output_dir("jump").name.endswith("_2")
+
+
 def test_given_output_folder_is_used_unchanged(tmp_path):
     assert output.output_dir("jump", tmp_path / "a" / "b") == tmp_path / "a" / "b"
     assert output.output_dir("jump", tmp_path / "a" / "b").is_dir()

@@ -72,3 +72,16 @@ def test_first_garbage_collection_is_late_and_there_is_none_at_the_end():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.split() == [str(startup.FIRST_COLLECTION_THRESHOLD), str(startup.COLLECTION_THRESHOLD), "end"]
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_files_and_progress_of_a_process_with_closed_standard_streams(tmp_path, closed):
+    code = (
+        "import sys; from jumper_warp.utils.progress import phase\n"
+        "with phase('waiting'), open(sys.argv[1], 'w') as file: print(file.fileno() > 2, file=file)\n"
+        "from jumper_warp.utils.runtime import init_warp; init_warp(); print('out'); print('err', file=sys.stderr)"
+    )
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", code, str(tmp_path / "file")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and (tmp_path / "file").read_text() == "True\n"
+    assert ("out" in done.stdout, "err" in done.stderr) == (">&-" not in closed.split(), "2>&-" not in closed)
