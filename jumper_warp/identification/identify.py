@@ -26,7 +26,7 @@ from jumper_warp.identification.least_squares import (
     Trial,
     replace_residuals,
 )
-from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
+from jumper_warp.identification.motions import NoiseLevels, RecordedMotion, check_distinct
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import Linearised, MotionResiduals, pieces_of
@@ -76,10 +76,10 @@ def identify(
 
     prior_measurements: such as a weighed mass. dt [s]: largest physics step, by default 1/480. replay: simulation to
     reuse from an earlier call; it overrides description, device and threads (of the CPU). Raises InputError: no
-    motions, or motions with gaps, without measurements or in which the simulation diverges.
+    motions, the same motion twice, motions with gaps, without measurements or in which the simulation diverges, or
+    motions that identify no parameter.
     """
-    if not motions:
-        raise InputError("there must be at least one motion")
+    check_distinct(motions)
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
         replay = MotionReplay(description=description, device=device, threads=threads)
@@ -119,8 +119,9 @@ def identify_by_evolution(
         import cma
     except ImportError:
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
-    if not motions or not max_seconds > 0.0 or population < 4:
-        raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
+    check_distinct(motions)
+    if not max_seconds > 0.0 or population < 4:
+        raise InputError("evolution needs a time above 0 s and a population of at least 4")
     replay = MotionReplay(device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, prior_measurements)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
@@ -144,6 +145,25 @@ class RecordedMotion:
         data = io.BytesIO()
         np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self.columns())
         write_atomically(path, data.getvalue())
+
+
+def check_distinct(motions: Sequence[RecordedMotion]) -> None:
+    """Raise InputError unless there are motions and each is another recording, as the same data twice halves variances.
+
+    Two are the same if their targets and the channels that both measured agree to rounding; time may begin elsewhere.
+    """
+    if not motions:
+        raise InputError("there must be at least one motion")
+    for (i, one), (j, other) in itertools.combinations(enumerate(motions, 1), 2):
+        both, columns = one.columns(), other.columns()
+        names = [name for name in both if name in columns and name != "time"]
+        if len(names) > 1 and all(_agree(both[name], columns[name]) for name in names):
+            raise InputError(f"motions {i} ({one.name}) and {j} ({other.name}) are the same recording: give it once")
+
+
+def _agree(one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether two arrays have one shape and equal values, within 1e-6 [SI]; NaN equals NaN."""
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1.0e-6, equal_nan=True)
 
 
 def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jumper_warp.policies.manifest import CONFIG, MANIFEST, ONNX, README
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
@@ -16,10 +17,6 @@ from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import read_file, read_json
 
-MANIFEST = "manifest.json"
-CONFIG = "config.json"
-ONNX = "policy.onnx"
-README = "README.md"
 METRICS = "metrics.json"
 PICTURE = "picture.webp"
 SUCCESSES = ("success_rate", "settled_without_collision_rate")

@@ -8,27 +8,31 @@ code.
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
+import secrets
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from jumper_warp.policies.catalog import CONFIG, MANIFEST, ONNX, README, find_policy
+from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.manifest import (
+    CONFIG,
+    MANIFEST,
+    ONNX,
+    README,
+    SCHEMA_VERSION,
+    check_version,
+    parse_object,
+    read_files,
+    write_files,
+)
 from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.utils.checks import version_error
-from jumper_warp.utils.files import json_bytes, parse_json, read_file, write_atomically
+from jumper_warp.utils.files import json_bytes
+from jumper_warp.utils.locks import directory_lock
 from jumper_warp.utils.runtime import source_versions
 
-FORMAT = "jumper-warp policy"
-SCHEMA_VERSION = 3
-PURPOSE = "file of a policy"
-PICTURES = (".png", ".webp", ".jpg", ".gif")  # Suffixes of files that a policy does not need
-FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
 
 
@@ -53,15 +57,18 @@ def save_policy(
         ONNX: onnx_bytes(policy, config),
         README: default_readme(policy).encode(),
     }
-    aside = folder.with_name(f".{folder.name}.{os.getpid()}")
-    old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    token = secrets.token_hex(4)
+    aside, old = (folder.with_name(f".{folder.name}.{token}{end}") for end in ("", ".old"))
     aside.mkdir(parents=True)
     try:
-        _write(aside, content, {})
-        if folder.exists():
-            os.replace(folder, old)
-        os.replace(aside, folder)
+        write_files(aside, content, {})
+        with directory_lock(folder.parent):
+            if folder.exists():
+                os.replace(folder, old)
+            os.replace(aside, folder)
     finally:
+        if old.exists() and not folder.exists():
+            os.rename(old, folder)
         shutil.rmtree(aside, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
     return folder
@@ -84,26 +91,11 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
     Raises PolicyError: the folder is not an intact policy, or a name is malformed or one of the policy's own.
     """
     folder = Path(folder)
-    checksums = _verified_checksums(folder)
     reserved = sorted({CONFIG, ONNX, MANIFEST} & set(files))
     if reserved:
         raise PolicyError(f"{folder}: {reserved[0]} is the policy itself")
-    _write(folder, files, checksums)
-
-
-def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Write a policy's files (name to content), then its manifest. Raises PolicyError: a name is malformed.
-
-    checksums: SHA-256 by name of the files that the folder has already; the manifest keeps them.
-    """
-    for name in files:
-        if not FILE_NAME.fullmatch(name) or name == MANIFEST:
-            raise PolicyError(f"a policy cannot hold a file named {name!r:.60}")
-    written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}
-    sha256 = dict(sorted({**checksums, **written}.items()))
-    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": sha256}
-    for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
-        write_atomically(folder / name, data)
+    with directory_lock(folder.resolve().parent):
+        write_files(folder, files, read_files(folder).checksums)
 
 
 def read_policy(name: str | Path) -> Policy:
@@ -113,61 +105,14 @@ def read_policy(name: str | Path) -> Policy:
     not of the shape in its configuration.
     """
     folder = find_policy(name)
-    checksums = _verified_checksums(folder)
-    config = _parse_json(folder / CONFIG, _read_verified(folder / CONFIG, checksums[CONFIG]))
-    _check_version(folder / CONFIG, config)
-    data = _read_verified(folder / ONNX, checksums[ONNX])
+    files = read_files(folder).content
+    config = parse_object(folder / CONFIG, files[CONFIG])
+    check_version(folder / CONFIG, config)
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
-        return policy_from_onnx(data, interface, config)
+        return policy_from_onnx(files[ONNX], interface, config)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
-
-
-def _verified_checksums(folder: Path) -> dict[str, str]:
-    """Verify a policy's version and files, and return the manifest's SHA-256 by file name.
-
-    Raises PolicyError.
-    """
-    path = folder / MANIFEST
-    manifest = _parse_json(path, read_file(path, PURPOSE, error=PolicyError))
-    if manifest.get("format") != FORMAT:
-        raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
-    _check_version(path, manifest)
-    checksums = manifest.get("sha256")
-    if not isinstance(checksums, dict) or not {CONFIG, ONNX} <= set(checksums):
-        raise PolicyError(f"{path}: lacks the checksums of {CONFIG} and {ONNX}")
-    for name, digest in checksums.items():
-        if not FILE_NAME.fullmatch(name):
-            raise PolicyError(f"{path}: names a file {name!r:.60}")
-        if not name.endswith(PICTURES) or os.path.lexists(folder / name):
-            _read_verified(folder / name, digest)
-    return checksums
-
-
-def _check_version(path: Path, content: Mapping[str, Any]) -> None:
-    """Raise PolicyError unless a JSON file's content has the present schema version."""
-    if (version := content.get("schema_version")) != SCHEMA_VERSION:
-        raise PolicyError(f"{path}: {version_error(f'{version!r:.20}', SCHEMA_VERSION)}")
-
-
-def _read_verified(path: Path, digest: Any) -> bytes:
-    """Read a policy's file, and verify its SHA-256.
-
-    Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`.
-    """
-    data = read_file(path, PURPOSE, error=PolicyError)
-    if hashlib.sha256(data).hexdigest() != digest:
-        raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
-    return data
-
-
-def _parse_json(path: Path, data: bytes) -> dict[str, Any]:
-    """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none."""
-    content = parse_json(data, str(path), PolicyError)
-    if not isinstance(content, dict):
-        raise PolicyError(f"{path}: not a JSON object")
-    return content
 
 
 def default_readme(policy: Policy) -> str:

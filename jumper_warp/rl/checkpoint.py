@@ -49,10 +49,13 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     torch.save(state, buffer)
     data = buffer.getvalue()
     path = folder / f"iteration_{state['iteration']:06d}.pt"
-    write_atomically(path, data)
     manifest = _read_manifest(folder, missing_ok=True)
-    manifest.pop(path.name, None)  # the order of entries is the order of saving
     digest = hashlib.sha256(data).hexdigest()
+    if path.name in manifest:  # if the process is killed, the old or the new file is valid
+        manifest[path.name]["updating"] = digest
+        write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    write_atomically(path, data)
+    manifest.pop(path.name, None)  # the order of entries is the order of saving
     manifest[path.name] = {"sha256": digest, "iteration": state["iteration"], "score": score}
     kept = [*list(manifest)[-max_checkpoints:], _best(manifest)]
     removed = [name for name in manifest if name not in kept]
@@ -75,7 +78,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
     data = read_file(path, PURPOSE, MAX_BYTES, CheckpointError)
-    if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+    if hashlib.sha256(data).hexdigest() not in (entry["sha256"], entry.get("updating")):
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
     state = _decoded(path, data)
     if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:

@@ -1,13 +1,15 @@
 """Atomic file writes, and bounded reading of regular files and of JSON."""
 
+import fcntl
 import json
 import math
 import os
 import stat
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from jumper_warp.utils.errors import InputError
 
@@ -25,21 +27,39 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
+        with _open_alone(part) as file:
+            try:
+                file.truncate(0)  # the rest of a write that was killed
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(part, path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
     except OSError as error:
         error.filename = str(path)
         raise
-    finally:
-        part.unlink(missing_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def _open_alone(part: Path) -> BinaryIO:
+    """Open a file to append to it, and lock it against other processes and threads that write it, until it is closed.
+
+    Waits for those, which rename the file that they have opened.
+    """
+    while True:
+        file = part.open("ab")
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
+                return file
+        file.close()
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:

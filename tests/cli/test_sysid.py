@@ -116,6 +116,14 @@ def test_inconsistent_fit_exits_with_3_and_renames_the_overlay(recorded, capsys)
     assert all(test["chi2"] > test["limit"] for test in failed) and failed[0]["channel"] == "angle"
 
 
+def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", "fit", str(recorded / "motions"), str(recorded / "motions"), *PARAMS])
+    assert end.value.code == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "motions 1 (0_hung_chirp) and 5 (0_hung_chirp) are the same recording: give it once" in error
+
+
 def test_refuses_negated_angles_without_warnings(recorded, capsys):
     write_csv_table(recorded / "flipped.csv", load_motion(recorded / "motions" / "2_standing_chirp.npz"), -1.0)
     with warnings.catch_warnings(), pytest.raises(SystemExit) as end:

@@ -223,6 +223,23 @@ def test_parameters_refuse_bad_priors_names_and_groups():
         jumper_parameters(["gears"])
 
 
+def test_identify_refuses_a_recording_given_twice(standing):
+    motion = standing[0].motion
+    copy = replace(motion, name="copy", time=motion.time + 5.0, position=None, angle=motion.angle + 1.0e-12)
+    for motions in ([motion, motion], [motion, replace(motion, angle=motion.angle + 0.001), copy]):
+        with pytest.raises(InputError, match=rf"motions 1 \(standing\) and {len(motions)} .* are the same recording"):
+            identify(motions, jumper_parameters())
+
+
+def test_identify_refuses_a_robot_that_does_not_move(replay):
+    parameters, rng = jumper_parameters(["latency"]), np.random.default_rng(0)
+    plan, robots = sample_plan("hung chirp", rng, seconds=0.5), parameters.robots(np.zeros((1, 1)))
+    plan = replace(plan, target=np.repeat(plan.target[:1], len(plan.target), axis=0))
+    motion = measure(plan, "still", replay_plan(replay, plan, robots), robots, rng)
+    with pytest.raises(InputError, match="identify none of 1 parameters: latency: the targets hardly change"):
+        identify([motion], parameters, replay=replay)
+
+
 def test_identify_refuses_no_motions():
     with pytest.raises(InputError, match="at least one motion"):
         identify([], jumper_parameters())

@@ -1,3 +1,4 @@
+import itertools
 import json
 import os
 import pickle
@@ -134,6 +135,22 @@ def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     path, loaded, skipped, _ = latest_checkpoint(tmp_path)
     assert (path, loaded["iteration"]) == (paths[0], 1)
     assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
+
+
+@pytest.mark.parametrize("stop", range(3))  # of the renames to the manifest, the checkpoint and the manifest
+def test_only_checkpoint_stays_usable_if_saving_it_again_is_stopped(tmp_path, monkeypatch, stop):
+    save_checkpoint(tmp_path, state(1), max_checkpoints=1)
+    renames, replace = itertools.count(), os.replace
+
+    def stopped(source, target):
+        if next(renames) == stop:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(tmp_path, state(1) | {"seconds": 2.0}, max_checkpoints=1)
+    assert latest_checkpoint(tmp_path).state["iteration"] == 1
 
 
 def test_latest_checkpoint_raises_if_all_are_damaged(tmp_path):

@@ -1,0 +1,103 @@
+"""Updates of a policy's folder that are interrupted, fail on a full disk, or run at the same time."""
+
+import errno
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from boundary import small_policy
+from jumper_warp.policies.folder import add_files, read_policy, save_policy
+from jumper_warp.utils.files import write_atomically
+
+OLD = {"metrics.json": b"{}", "run.json": b"{}"}
+NEW = {"metrics.json": b'{"new": 1}', "run.json": b'{"new": 2}', "plot.txt": b"new"}
+
+
+class RenameFault:
+    """Replacement of os.replace that raises an exception instead of rename number `stop`, from 0."""
+
+    def __init__(self, stop, error):
+        self.stop, self.error, self.count, self.replace = stop, error, 0, os.replace
+
+    def __call__(self, source, target):
+        self.count += 1
+        if self.count == self.stop + 1:
+            raise self.error
+        self.replace(source, target)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Folder of a policy with the files `OLD`."""
+    return save_policy(tmp_path / "jump", small_policy(), files=OLD)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
+@pytest.mark.parametrize("stop", range(5))  # of the renames to both manifests and three files
+def test_policy_loads_after_an_update_that_was_stopped_at_any_file(folder, monkeypatch, stop, error):
+    fault = RenameFault(stop, error)
+    monkeypatch.setattr(os, "replace", fault)
+    with pytest.raises(type(error)):
+        add_files(folder, NEW)
+    read_policy(folder)
+    for name, data in NEW.items():
+        assert not (folder / name).exists() or (folder / name).read_bytes() in (OLD.get(name), data)
+    assert [path.name for path in folder.iterdir() if path.name.endswith(".part")] == []
+    add_files(folder, NEW)
+    read_policy(folder)
+    (folder / "metrics.json").write_bytes(OLD["metrics.json"])  # an altered file after a complete update
+    with pytest.raises(ValueError, match=r"metrics\.json: truncated or altered"):
+        read_policy(folder)
+
+
+def test_two_writers_and_a_reader_of_a_policy_leave_it_loadable(folder):
+    def write(writer):
+        for i in range(15):
+            add_files(folder, {"metrics.json": f"[{writer}, {i}]".encode(), f"{writer}.json": b"%d" % i})
+
+    def read(_):
+        for _ in range(60):
+            read_policy(folder)
+
+    with ThreadPoolExecutor(3) as threads:
+        jobs = [threads.submit(write, 1), threads.submit(write, 2), threads.submit(read, 0)]
+        for job in jobs:
+            job.result()
+    read_policy(folder)
+    assert (folder / "1.json").read_bytes() == (folder / "2.json").read_bytes() == b"14"
+    for name in ("1.json", "2.json"):  # both are in the manifest
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(b"altered")
+        with pytest.raises(ValueError, match="truncated or altered"):
+            read_policy(folder)
+        (folder / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("stop", range(6))  # of the renames to four files and of two folders
+def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monkeypatch, stop):
+    monkeypatch.setattr(os, "replace", RenameFault(stop, KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        save_policy(folder, small_policy(), overwrite=True)
+    read_policy(folder)
+    assert (folder / "metrics.json").read_bytes() == OLD["metrics.json"]
+    assert [path.name for path in folder.parent.iterdir()] == ["jump"]
+
+
+def test_threads_may_write_one_file_at_a_time(tmp_path):
+    contents = [bytes([65 + i]) * 10_000 * (i + 1) for i in range(4)]
+
+    def write(content):
+        for _ in range(50):
+            write_atomically(tmp_path / "file", content)
+            assert (tmp_path / "file").read_bytes() in contents
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(write, contents)) == 4 * [None]
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_part_of_a_killed_write_is_replaced(tmp_path):
+    (tmp_path / "file.part").write_bytes(b"partial and longer")
+    write_atomically(tmp_path / "file", b"whole")
+    assert (tmp_path / "file").read_bytes() == b"whole" and [each.name for each in tmp_path.iterdir()] == ["file"]
