@@ -4,7 +4,7 @@
 
 This is the paper's test of the horizontal jump: goals spread evenly over 0.3 to 1.5 m ahead, one jump each. A jump
 succeeds if it starts on command, only paws touch anything, and a second after touchdown the base is at rest within 0.1
-m of the goal. `jumper evaluate horizontal_jump --suite sweep` runs the same test.
+m of the goal. `jumper evaluate horizontal_jump --suite range` runs the same test.
 """
 
 from jumper_warp.evaluation.sweeps import DistanceSweep

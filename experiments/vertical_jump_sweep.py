@@ -6,7 +6,7 @@
 This is the paper's test of the vertical jump: heights spread evenly over 0.5 to 1.2 m, one jump each. A height is
 reached if the highest base height is within 0.1 m of it. A jump succeeds if it also starts on command, only paws touch
 anything, and the base is at rest a second after touchdown. The open-loop jump of the same robots shows the height that
-each can reach. `jumper evaluate vertical_jump --suite sweep` runs the same test.
+each can reach. `jumper evaluate vertical_jump --suite range` runs the same test.
 """
 
 from jumper_warp.evaluation.sweeps import HeightSweep

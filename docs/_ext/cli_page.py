@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Iterable, Sequence
-from typing import Any
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from jumper_warp.cli.completion import CompletionCfg, settings_of
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
 from jumper_warp.cli.export import ExportCfg
 from jumper_warp.cli.export_robot import ExportRobotCfg
 from jumper_warp.cli.flags import Flag, list_flags
-from jumper_warp.cli.help import default_text
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
@@ -33,6 +34,7 @@ COMMON = {
     "sysid excite": ("params", "seconds", "robot", "seed", "out"),
 }
 """Names of the flags that stand before the list of all flags."""
+METAVARS: dict[Any, str] = {bool: "", int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 FULL_LIST = 10  # Largest number of flags without a second list
 
 
@@ -40,7 +42,7 @@ def cli_page() -> str:
     """Return the Markdown of the command reference: a section for each command, then completion and exit codes."""
     train = settings_of("train")[0]
     parts = [
-        section("train TASK", COMMANDS["train"], list_flags(train), headings=SHORT_HELP,
+        section("train TASK", COMMANDS["train"], list_flags(train), headings={"Common flags": SHORT_HELP},
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
         of_kinds("play", ABOUT_PLAY, {name: list_flags(PlayCfg(kind.play)) for name, kind in EVALUATIONS.items()},
@@ -126,6 +128,31 @@ def grouped(flags: Sequence[Flag]) -> str:
     return "\n\n".join(parts)
 
 
+def metavar(kind: Any) -> str:
+    """Return the placeholder of a type's values: INT, {a,b}, FLOAT FLOAT, TEXT ...; empty for a switch."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return metavar(parts[0])
+    if origin is Literal:
+        return f"{{{','.join(str(part) for part in parts if part != '')}}}"
+    if origin in (Union, UnionType):
+        return "|".join(metavar(part) for part in parts if part is not type(None))
+    if origin is tuple:
+        return f"{metavar(parts[0])} ..." if Ellipsis in parts else " ".join(map(metavar, parts))
+    return METAVARS.get(kind, getattr(kind, "__name__", str(kind)).upper())
+
+
+def default_text(default: Any) -> str:
+    """Return a flag's default value as text; empty for None, and for a value that no flag can give."""
+    if isinstance(default, bool):
+        return "on" if default else "off"
+    if isinstance(default, tuple):
+        return " ".join(map(default_text, default))
+    if isinstance(default, float):
+        return f"{default:g}"
+    return str(default) if isinstance(default, str | int | Path) else ""
+
+
 def definitions(flags: Iterable[Flag]) -> str:
     """Return the definition list of flags: name and value, then description and default."""
     return "\n\n".join(f"`{spelling(flag)}`\n: {meaning(flag)}" for flag in flags)
@@ -136,7 +163,7 @@ def spelling(flag: Flag) -> str:
     if flag.positional:
         return flag.name
     start, dot, last = flag.name.rpartition(".")
-    return f"--{start}{dot}[no-]{last}" if flag.has_negative else f"--{flag.name} {flag.metavar}".rstrip()
+    return f"--{start}{dot}[no-]{last}" if flag.has_negative else f"--{flag.name} {metavar(flag.kind)}".rstrip()
 
 
 def meaning(flag: Flag) -> str:

@@ -7,14 +7,14 @@ The names are those of today's package; flags of a single task, --env, are left 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Literal, get_args, get_origin
 
 import tyro
 
-from jumper_warp.cli.flags import Flag, list_flags
+from jumper_warp.cli.flags import list_flags
 from jumper_warp.cli.main import COMMANDS, TASK_MODULE, parse
 
 SCRIPT = """\
@@ -64,12 +64,15 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     names |= {"train": tasks, "info": (*tasks, *policies), "sysid": ("fit", "excite", "actuator")}
     names["completion"] = ("bash", "zsh")
     flags = {command: [flag for cfg in settings_of(command) for flag in list_flags(cfg)] for command in COMMANDS}
-    script = SCRIPT.format(
-        commands=" ".join(COMMANDS),
-        flags=cases({command: options(each) for command, each in flags.items()}),
-        values=cases(choices(flag for each in flags.values() for flag in each)),
-        names=cases(names),
-    )
+    common = (TASK_MODULE, "--help", "--help-all")
+    options = {c: dict.fromkeys([*(o for flag in each for o in flag.options), *common]) for c, each in flags.items()}
+    values = {
+        f"--{flag.name}": map(str, filter(None, get_args(flag.kind)))
+        for each in flags.values()
+        for flag in each
+        if get_origin(flag.kind) is Literal
+    }
+    script = SCRIPT.format(commands=" ".join(COMMANDS), flags=cases(options), values=cases(values), names=cases(names))
     print((ZSH if cfg.shell == "zsh" else "") + script, end="")
 
 
@@ -93,21 +96,6 @@ def settings_of(command: str) -> list[Any]:
     }.get(command, [])
 
 
-def options(flags: Iterable[Flag]) -> list[str]:
-    """Return the spellings of flags that a shell completes: the given flags, and those that every command has."""
-    given = (option for flag in flags for option in flag.options)
-    return list(dict.fromkeys([*given, TASK_MODULE, "--help", "--help-all"]))
-
-
-def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
-    """Return the allowed values of each flag with a fixed set of values, by flag such as `--solver`."""
-    return {
-        f"--{flag.name}": [str(value) for value in get_args(flag.kind) if value]
-        for flag in flags
-        if get_origin(flag.kind) is Literal
-    }
-
-
-def cases(words: dict[str, Iterable[str]] | dict[str, list[str]]) -> str:
+def cases(words: Mapping[str, Iterable[str]]) -> str:
     """Return the branches of the shell script's `case` statement: for each name, the words that may follow it."""
     return "\n".join(f'            {name}) words="{" ".join(each)}" ;;' for name, each in words.items())

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
-from jumper_warp.cli.renamed_flags import join_height_range
 from jumper_warp.utils.errors import suggestion
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ usage: jumper {command} POLICY [flags]
 jumper {command} POLICY --help lists the flags."""
 ABOUT = """\
 Measure a policy over many trials, print its metrics and write metrics.json.
-jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: sweep
-over heights or distances, grid, ring, consecutive, platform, or max distance."""
+jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: range
+of heights or distances, grid, ring, consecutive, platform, or max distance."""
 SUITE = "--suite"
 
 
@@ -104,7 +103,4 @@ def parse(command: str, task: TaskCfg, args: Sequence[str], kind: Any, flags_of:
 
     policy, *args = args
     flags = flags_of(evaluation_of(task))
-    if hasattr(flags, "height_range"):
-        args = join_height_range(args, flags.height_range)
-    settings = {"description": kind.__doc__, "default": kind(flags), "subject": f"policies of {task.name}"}
-    return parse_flags(kind[type(flags)], f"{command} {policy}", args, **settings)
+    return parse_flags(kind[type(flags)], f"{command} {policy}", args, description=kind.__doc__, default=kind(flags))

@@ -1,4 +1,4 @@
-"""List of the flags that tyro generates from a dataclass, for help, suggestions, renamed flags and completion."""
+"""List of the flags that tyro generates from a dataclass, for short help pages, limits and completion."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import tyro
 
 from jumper_warp.utils.checks import MOST_WORLDS
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.errors import InputError, suggestion
 
 LARGEST = 2.0**31  # Largest absolute value of a number in a flag
 MOST_TRIALS = 100_000  # Largest number of jumps, walks or robots, which needs some 10 GB
 FLAG_LIMITS = {"num-envs": MOST_WORLDS, "num-steps": LARGEST, "trials": MOST_TRIALS, "states": MOST_TRIALS,
                "repeats": 10_000, "seconds": 3600.0}  # fmt: skip
 """Largest value of a number in a flag by the last part of its name."""
-METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", type(None): "None"}
+HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 
 
 class Flag(NamedTuple):
@@ -59,10 +58,8 @@ class Flag(NamedTuple):
         """First sentence of the flag's description, without its full stop."""
         return self.about.split(". ")[0].rstrip(".")
 
-    @property
-    def metavar(self) -> str:
-        """Placeholder of the flag's value in help pages, such as "INT" or "{off,actor}"; empty for a switch."""
-        return "" if self.kind is bool else metavar(self.kind)
+
+TASK_MODULE_FLAG = Flag("task-module", Path | None, None, "File or installed module with tasks of your own; repeatable")
 
 
 def list_flags(cfg: Any, prefix: str = "", group_about: str = "", *, described: bool = True) -> list[Flag]:
@@ -89,7 +86,8 @@ def list_flags(cfg: Any, prefix: str = "", group_about: str = "", *, described: 
             flags += list_flags(nested, inner, group, described=described)
             continue
         name = name.upper() if tyro.conf.Positional in marks else prefix + name
-        flags.append(Flag(name, hint, default, about, tuple(marks), group_about))
+        marks = tuple(mark for mark in marks if not hasattr(mark, "name"))
+        flags.append(Flag(name, hint, default, about, marks, group_about))
     return flags
 
 
@@ -119,18 +117,43 @@ def field_docs(kind: type) -> dict[str, str]:
     return docs
 
 
-def metavar(kind: Any) -> str:
-    """Return the placeholder of a type's values in help pages: INT, {a,b}, FLOAT FLOAT, TEXT ..."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return metavar(parts[0])
-    if origin is Literal:
-        return f"{{{','.join(str(part) for part in parts if part != '')}}}"
-    if origin in (Union, UnionType):
-        return "|".join(metavar(part) for part in parts if part is not type(None))
-    if origin is tuple:
-        return f"{metavar(parts[0])} ..." if Ellipsis in parts else " ".join(map(metavar, parts))
-    return METAVARS.get(kind, getattr(kind, "__name__", str(kind)).upper())
+def wants_help(args: Sequence[str]) -> bool:
+    """Return whether command-line arguments ask for help."""
+    return any(arg in (*HELP, HELP_ALL) for arg in args)
+
+
+def print_help(
+    program: str, about: str, flags: Sequence[Flag], args: Sequence[str], short: Sequence[str] | None = None
+) -> None:
+    """Print the help page that `--help`, `--help GROUP` or `--help-all` among the arguments requests; exits with 0.
+
+    program: command line without flags. about: what it does. short: names of the flags of --help (default: all), each
+    with the first sentence of its description. Raises InputError: there is no such group.
+    """
+    groups = dict.fromkeys(re.findall(r"^(env\.[^.\n]+|[^.\n]+)\.", "\n".join(flag.name for flag in flags), re.M))
+    following = [group for arg, group in itertools.pairwise([*args, "-"]) if arg in HELP]
+    if HELP_ALL not in args and not following[0].startswith("-"):
+        name = following[0].replace("_", "-")
+        flags = [flag for flag in flags if f"{flag.name}.".startswith(f"{name}.")]
+        if not flags:
+            near = suggestion(name, groups) or f"; there are {', '.join(groups) or 'none'}"
+            raise InputError(f"no group of flags {name!r:.60}{near}")
+    elif HELP_ALL not in args:
+        by_name = {flag.name: flag for flag in flags}
+        flags = [flag._replace(about=flag.first_sentence) for flag in map(by_name.__getitem__, short or by_name)]
+        about, _, _ = about.partition("\n\n")
+        about += f"\n--help GROUP prints a group of flags: {', '.join(groups)}." if groups else ""
+        about += "\n--help-all prints all flags in full."
+    kind = dataclasses.make_dataclass("Flags", [help_field(flag) for flag in flags], kw_only=True)
+    tyro.cli(kind, prog=program, description=about, args=["--help"], config=(tyro.conf.DisallowNone,))
+
+
+def help_field(flag: Flag) -> tuple[str, Any, Any]:
+    """Return a field of a dataclass, as for `dataclasses.make_dataclass`, whose help in tyro describes a flag."""
+    hint = "" if flag.default is None or "(default" in flag.about else None
+    settings = tyro.conf.arg(name=flag.name, help=flag.about, help_behavior_hint=hint)
+    name = re.sub(r"\W", "_", flag.name)
+    return name, Annotated[(flag.kind, settings, *flag.marks)], dataclasses.field(default=flag.default)
 
 
 def check_numbers(settings: Any) -> None:

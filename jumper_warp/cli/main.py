@@ -6,26 +6,19 @@ A command imports only what it needs, so that help and usage errors print at onc
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import importlib
 import inspect
 import io
-import itertools
 import os
-import re
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
 from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
-
-if TYPE_CHECKING:
-    from jumper_warp.cli.flags import Flag
-    from jumper_warp.cli.help import Short
 
 FAULT = 1  # Exit code for a fault of the program or the machine
 USAGE_ERROR = 2  # Exit code for input that cannot be used
@@ -133,64 +126,41 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def parse(
     kind: Any, command: str, args: Sequence[str], *, description: str | None = None, default: Any = None,
-    short: Short | None = None, subject: str | None = None, program: str | None = None,
+    short: Sequence[str] | None = None, program: str | None = None,
 ) -> Any:  # fmt: skip
     """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
 
     kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
-    `kind`. short: flags of --help, as for `help_page` (default: all). subject: what has the flags, for errors (default:
-    the command). program: command line of a script in place of `jumper COMMAND`, without --task-module.
-    Raises UsageError: there is no such flag, or a value is missing or of another type.
+    `kind`. short: names of the flags of --help (default: all). program: command line of a script in place of
+    `jumper COMMAND`, without --task-module.
+    Raises InputError: a setting is out of range. Exits with 2 and tyro's message: there is no such flag, or a value is
+    missing or of another type.
     """
-    from jumper_warp.cli.flags import Flag, check_numbers, list_flags, option_of
-    from jumper_warp.cli.help import help_page, wants_help
-    from jumper_warp.cli.renamed_flags import use_new_names
-
-    task_module = Flag(
-        "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
-    )
-    fields = kind if default is None else default
-    flags = list_flags(fields, described=wants_help(args)) + ([task_module] if program is None else [])
-    program = program or f"jumper {command}"
-    if wants_help(args):
-        print(help_page(program, description or inspect.getdoc(kind) or "", flags, args, short), end="")
-        raise SystemExit(0)
-    args = use_new_names(args, fields)
-    options = {option for flag in flags for option in flag.options}
-    for option in filter(None, map(option_of, args)):
-        if option not in options:
-            near = suggestion(option[2:], (each[2:] for each in options)).replace("'", "'--", 1)
-            near = near or f"; {program} --help lists the flags"
-            raise UsageError(f"no flag {option} for {subject or command}{near}")
     import tyro
 
-    printed, settings = io.StringIO(), {} if default is None else {"default": default}
+    from jumper_warp.cli.flags import TASK_MODULE_FLAG, check_numbers, list_flags, print_help, wants_help
+
+    settings: dict[str, Any] = {"prog": program or f"jumper {command}"}
+    about = description or inspect.getdoc(kind) or ""
+    if wants_help(args):
+        flags = list_flags(kind if default is None else default) + ([] if program else [TASK_MODULE_FLAG])
+        print_help(settings["prog"], about, flags, args, short)
+    settings |= {} if default is None else {"default": default}
+    printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
             parsed = tyro.cli(kind, args=args, **settings)
-    except SystemExit:
-        raise UsageError(parse_error(printed.getvalue(), list_flags(fields), args)) from None
+    except SystemExit as end:
+        error: BaseException | None = end
+        while error is not None and not isinstance(error, InputError):
+            error = error.__context__
+        if error is not None:  # raised by a dataclass of settings; tyro has printed it in a box
+            raise error from None
+        print(printed.getvalue(), end="", file=sys.stderr)
+        raise
     print(printed.getvalue(), end="", file=sys.stderr)
     check_numbers(parsed)
     return parsed
-
-
-def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str:
-    """Return an error message of one line for arguments that tyro refused; printed: tyro's message in its box."""
-    from jumper_warp.cli.flags import values_of
-
-    printed = re.sub(r"\x1b\[[0-9;]*m", "", printed)  # colours, on a terminal
-    lines = [line.strip("│ ") for line in printed.splitlines()[1:]]
-    message = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
-    missing = [flag for flag in flags if flag.positional and flag.default is dataclasses.MISSING]
-    if missing and message.startswith("Missing from"):
-        return f"{missing[0].name} is missing: {missing[0].first_sentence}"
-    options = {option: flag for flag in flags for option in flag.options}
-    for word in re.findall(r"--[\w.-]+", message):
-        if flag := options.get(word.rstrip(".")):
-            got = f"{' '.join(values_of(word, args)) or 'nothing':.100}"
-            return f"--{flag.name} takes {flag.metavar}, got {got}"
-    return re.sub(r"^Error parsing \w+: ", "", message).replace("Unrecognized options:", "unexpected argument")
 
 
 def run_command(command: Callable[[], object]) -> None:

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.flags import list_flags, option_of, switch_of, values_of
-from jumper_warp.cli.help import wants_help
+from jumper_warp.cli.flags import list_flags, option_of, switch_of, values_of, wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
-from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
@@ -36,14 +34,12 @@ if TYPE_CHECKING:
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
 PRESET_STEPS_PER_SECOND = 20_000.0  # [1/s] Policy steps on two cores with a preset, of all worlds
 SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
-SHORT_HELP = {
-    "Size and length": ("preset", "num-envs", "max-iterations", "max-seconds", "seed"),
-    "Physics and robot": ("randomize", "noise", "history", "solver", "robot"),
-    "Continue or start from a policy": ("resume", "init-policy"),
-    "Learning": ("trainer", "ppo.hidden", "ppo.lr", "ppo.entropy-coef"),
-    "Machine and output": ("device", "threads", "log-root", "save-interval", "task-module"),
-}
-"""Flags on the page of `jumper train --help`, by heading."""
+SHORT_HELP = (
+    "preset", "num-envs", "max-iterations", "max-seconds", "seed", "randomize", "noise", "history", "solver", "robot",
+    "resume", "init-policy", "trainer", "ppo.hidden", "ppo.lr", "ppo.entropy-coef", "device", "threads", "log-root",
+    "save-interval", "task-module",
+)  # fmt: skip
+"""Flags on the page of `jumper train --help`."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +236,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     modules: the user's, whose tasks are registered already.
     Raises as `parse_train` and `jumper_warp.training.train`.
     """
-    args = [*args[:1], *use_new_names(args[1:], TrainArgs())]
     recipe, checkpoint = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
     from jumper_warp.training import train

@@ -134,7 +134,7 @@ class HeightSweep(Sweep):
     height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
     num_recorded: int = 5
 
-    name: ClassVar = "sweep"
+    name: ClassVar = "range"
     evaluations: ClassVar = HEIGHTS
     paper: ClassVar = HEIGHT_PAPER
     summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
@@ -187,7 +187,7 @@ class DistanceSweep(Sweep):
     """Whether a second takeoff after landing ends a jump as a failure, as in the authors' configuration."""
     num_recorded: int = 5
 
-    name: ClassVar = "sweep"
+    name: ClassVar = "range"
     paper: ClassVar = PLACE_PAPER
     summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
     pushed: ClassVar = ("success_rate", "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate",

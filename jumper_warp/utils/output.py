@@ -1,11 +1,9 @@
 """Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
-import itertools
 import json
 import math
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,12 +53,14 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    for repeat in itertools.count(1):
-        folder = Path("outputs", name, stamp if repeat == 1 else f"{stamp}_{repeat}")
-        with suppress(FileExistsError):  # of this process, or of another one that has just made it
+    folder, repeat = Path("outputs", name, stamp), 1
+    while True:
+        try:
             folder.mkdir(parents=True)
-            break
-    return folder
+            return folder
+        except FileExistsError:  # of this process, or of another one that has just made it
+            repeat += 1
+            folder = folder.with_name(f"{stamp}_{repeat}")
 
 
 def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, Any] | None = None) -> Report:

@@ -66,7 +66,7 @@ HEAVY = ("torch", "newton", "pinocchio", "rerun", "matplotlib", "scipy", "onnx")
         (["train", "vertical-jump", "--help"], HEAVY),
         (["train", "velocity-rough", "--help-all"], HEAVY),
         (["evaluate", "vertical_jump", "--help"], HEAVY),
-        (["evaluate", "vertical_jump", "--suite", "sweep", "--help"], HEAVY),
+        (["evaluate", "vertical_jump", "--suite", "range", "--help"], HEAVY),
         (["play", "walking_flat", "--help"], HEAVY),
         (["play", "--script", "x", "--help"], HEAVY),
         (["finetune", "vertical_jump", "--help"], (*HEAVY, "warp")),
@@ -108,7 +108,7 @@ def test_help_lists_all_commands_and_task_module_flag(capsys):
 def test_each_command_prints_help(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
     assert code == 0
-    assert "usage: jumper" in out and "--task-module FILE_OR_MODULE" in out
+    assert "usage: jumper" in out and "--task-module" in out
 
 
 @pytest.mark.parametrize(
@@ -476,15 +476,14 @@ def test_json_flag_prints_metrics_json_and_nothing_else(still, tmp_path, capsys,
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["evaluate", "--height-range", "0.5", "1.2"], "no flag --height-range for policies of horizontal"),  # default
-        (["play", "--height", "0.9"], "no flag --height for policies of horizontal-jump"),
-        (["play", "--height", "0.6", "0.9", "1.1"], "no flag --height for policies of horizontal-jump"),
+        (["evaluate", "--height-range", "0.5", "1.2"], "Unrecognized options: --height-range, 0.5, 1.2"),  # default
+        (["play", "--height", "0.6", "0.9", "1.1"], "Unrecognized options: --height, 0.6, 0.9, 1.1"),
         (["evaluate", "--goal-x", "0.8", "0.4"], "goal_x must be in"),
     ],
 )
 def test_refuses_flags_of_other_tasks_and_falling_ranges(still, capsys, args, message):
     code, _, err = run(capsys, args[0], still, *args[1:], "--device", "cpu")
-    assert code == 2 and message in err[-1]
+    assert code == 2 and message in "\n".join(err)
 
 
 def test_play_writes_film_and_picture_and_prints_their_paths(still, tmp_path, capsys):

@@ -81,7 +81,7 @@ def test_numbers_stay_with_their_units():
 def test_every_command_has_a_section_with_its_common_flags_before_the_collapsed_ones(command_line):
     assert [name for name in COMMANDS if f"## `jumper {name}" not in command_line] == []
     common = command_line.partition("## `jumper train TASK`")[2].partition("{dropdown}")[0]
-    names = [name for group in SHORT_HELP.values() for name in group if name != "task-module"]
+    names = [name for name in SHORT_HELP if name != "task-module"]
     assert [name for name in names if f"--{name}" not in common and f"--[no-]{name}" not in common] == []
     assert "`--num-envs INT`\n: Number of simulated robots (worlds), over all processes. Default: `8192`." in common
 

@@ -148,6 +148,6 @@ def test_refuses_invalid_flags_before_training(tmp_path):
         departures.Args(only=("bracing",))
     with pytest.raises(InputError, match="at least 1"):
         departures.Args(iterations=0)
-    with pytest.raises(InputError, match="no flag --no-such-flag"):
+    with pytest.raises(SystemExit):  # with tyro's message
         departures.main(departures.Args(train_flags="--no-such-flag 1", out=tmp_path / "none"))
     assert not (tmp_path / "none").exists()

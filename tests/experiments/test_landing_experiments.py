@@ -309,7 +309,7 @@ def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
         "import sys\n"
         "for name in ('rerun', 'trimesh', 'pin', 'pinocchio'): sys.modules[name] = None\n"
         "from jumper_warp.cli.main import main\n"
-        "flags = '--suite sweep --num-jumps 3 --num-recorded 0 --device cpu --out'.split()\n"
+        "flags = '--suite range --num-jumps 3 --num-recorded 0 --device cpu --out'.split()\n"
         f"main(['evaluate', {policy!r}, *flags, {str(tmp_path)!r}])"
     )
     root = Path(__file__).parents[2]
