@@ -6,12 +6,15 @@ The policy comes first: its task decides which flags there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
+from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.utils.errors import suggestion
+from jumper_warp.utils.files import read_json
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
@@ -43,7 +46,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     policy = policy_of("evaluate", ABOUT, args)
     args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
-    run = open_run(policy, modules)
+    run = open_run(policy, modules, args)
     if SUITE in args:
         run_suite(run.task, args, modules)
         return
@@ -83,10 +86,20 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
     return str(newest_run(args[0]))
 
 
-def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
-    """Load a policy or a training run for evaluation. Raises PolicyError or CheckpointError if it cannot be used."""
+def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = ()) -> EvaluationRun:
+    """Load a policy or a training run for evaluation.
+
+    If args ask for help, only its saved recipe, whose `task` decides which flags there are, without PyTorch.
+    Raises PolicyError, CheckpointError or TaskError if it cannot be used.
+    """
     from jumper_warp.utils.progress import phase
 
+    if wants_help(args):
+        from jumper_warp.policies.catalog import CONFIG, find_policy
+        from jumper_warp.recipe import Recipe
+
+        folder = Path(policy).parents[1] if Path(policy).suffix == ".pt" else find_policy(policy)
+        return cast("Any", Recipe.from_json(read_json(folder / CONFIG, "configuration"), modules, complete=False))
     with phase(f"opening {policy}"):
         from jumper_warp.evaluation.run import EvaluationRun
 

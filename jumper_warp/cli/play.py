@@ -42,5 +42,5 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    run = open_run(policy, modules)
+    run = open_run(policy, modules, args)
     play(run, parse("play", run.task, args, PlayCfg, lambda kind: kind.play))

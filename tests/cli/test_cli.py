@@ -119,7 +119,6 @@ def test_each_command_prints_help(capsys, command):
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical_jump", "--robot", "robot.json"], "robot.json: no such file (robot overlay, as"),
         (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),
-        (["train", "vertical-jump", "--init-policy", "vertical_jmup"], "did you mean 'vertical_jump'?"),
         (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
         ([*TRAIN, "--env.rewards.jump-height.weight", "nan"], "jump-height.weight must be a finite number"),
@@ -546,15 +545,18 @@ def test_play_refuses_invalid_scripts(tmp_path, capsys, args, message):
 
 @pytest.mark.parametrize("command", ["evaluate", "play"])
 def test_refuses_output_folder_before_simulating(tmp_path, capsys, command):
+    (tmp_path / "file").touch()
+    code, _, err = run(capsys, command, "horizontal_jump", "--device", "cpu", "--out", str(tmp_path / "file"))
+    assert code == 2 and "File exists" in err[-1]
+
+
+def test_refuses_a_policy_with_another_observation_than_its_task(tmp_path, capsys):
     policy = still_policy("horizontal-jump")
-    names = ("other", *policy.interface.observation_names[1:])  # another name: no environment fits
+    names = ("other", *policy.interface.observation_names[1:])
     policy.interface = dataclasses.replace(policy.interface, observation_names=names)
     save_policy(tmp_path / "policy", policy)
-    (tmp_path / "file").touch()
-    args = [command, str(tmp_path / "policy"), "--device", "cpu", "--out"]
-    assert "observation differs from that of its task" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
-    code, _, err = run(capsys, *args, str(tmp_path / "file"))
-    assert code == 2 and "File exists" in err[-1]
+    _, _, err = run(capsys, "evaluate", str(tmp_path / "policy"), "--device", "cpu", "--out", str(tmp_path / "new"))
+    assert "observation differs from that of its task" in err[-1]
 
 
 def test_export_refuses_truncated_checkpoint(trained_run, tmp_path, capsys):
