@@ -20,7 +20,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
     )),
     "robot": ("Robot", (
         "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.bounds", "robot.grounds",
-        "robot.terrain", "robot.gravity", "robot.export", "robot.pinocchio_model",
+        "robot.terrain", "robot.gravity", "robot.export",
     )),
     "tasks": ("Tasks", (
         "registry", "tasks.jump.cfg", "tasks.jump.vertical", "tasks.jump.horizontal", "tasks.jump.mars",

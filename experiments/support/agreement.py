@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import LEGS, load_description
 from jumper_warp.robot.model import build_model
-from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
 from support.inverse_kinematics import random_motors
+from support.pinocchio_model import build_pinocchio
 
 MARGIN = 0.35  # [rad] Distance of the motor angles from the stops; a stretched leg is singular
 DT = 1.0e-6  # [s] Time step over which the change of velocity gives the acceleration

@@ -15,12 +15,12 @@ from jumper_warp.evaluation.attitude import TURN_METRICS, AttitudeLog, axis_metr
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
-from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import measure
 from support.momentum import momentum, rotational_inertia
+from support.pinocchio_model import build_pinocchio
 
 N = 64
 DEG = np.pi / 180.0

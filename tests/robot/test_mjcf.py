@@ -13,11 +13,11 @@ from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, load_description
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.errors import InputError
+from support.pinocchio_model import build_pinocchio
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 FILE = ASSETS / "jumper" / "jumper.xml"

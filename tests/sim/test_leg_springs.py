@@ -6,10 +6,10 @@ import pytest
 
 from jumper_warp.robot.model import load_description
 from jumper_warp.robot.overlay import RobotOverlay, with_springs
-from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.utils.errors import InputError
 from solver_helpers import Flight, Reference, bare_model, random_states
+from support.pinocchio_model import build_pinocchio
 
 STIFFNESS, LENGTH = 1000.0, 0.17  # [N/m], [m]
 KNEES = [[f"{leg}_{bar}_knee" for bar in ("outer", "inner")] for leg in ("FL", "FR", "BL", "BR")]
