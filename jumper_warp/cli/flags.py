@@ -150,8 +150,9 @@ def print_help(
 
 def help_field(flag: Flag) -> tuple[str, Any, Any]:
     """Return a field of a dataclass, as for `dataclasses.make_dataclass`, whose help in tyro describes a flag."""
-    hint = "" if flag.default is None or "(default" in flag.about else None
-    settings = tyro.conf.arg(name=flag.name, help=flag.about, help_behavior_hint=hint)
+    hint = "" if flag.default in (None, dataclasses.MISSING) or "(default" in flag.about else None
+    metavar = flag.name if flag.positional else None
+    settings = tyro.conf.arg(name=flag.name, metavar=metavar, help=flag.about, help_behavior_hint=hint)
     name = re.sub(r"\W", "_", flag.name)
     return name, Annotated[(flag.kind, settings, *flag.marks)], dataclasses.field(default=flag.default)
 
