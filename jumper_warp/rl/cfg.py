@@ -142,7 +142,7 @@ class TrainCfg:
     log_root: Path = Path("logs")
     """Folder of all runs. A run is written to log_root/<task>/<start time>."""
     log_interval: int = 10
-    """Number of iterations between two logged iterations."""
+    """Number of iterations between two logged iterations; those with a checkpoint are logged too."""
     save_interval: int = 100
     """Number of iterations between two checkpoints."""
     max_checkpoints: int = 3

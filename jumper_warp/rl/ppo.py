@@ -194,12 +194,13 @@ class Ppo:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the training's state from the result of `state_dict`: networks, optimiser, rate and episode counts.
 
+        The rate is limited to `min_lr` and `max_lr`.
         Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
         self._check_state(state)
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.lr.copy_(state["lr"])
+        self.lr.copy_(state["lr"]).clamp_(self.cfg.min_lr, self.cfg.max_lr)
         self.collector.episode.copy_(state["episode"])
 
     def _check_state(self, state: Any) -> None:

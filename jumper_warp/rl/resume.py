@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,14 @@ if TYPE_CHECKING:
     from jumper_warp.rl.distributed import Rank
 
 CHECKPOINTS = "checkpoints"  # Folder in a run's folder that holds its checkpoints
+FIXED = (
+    "best-metric", "ppo.init-std", "ppo.normalise-value", "env.motors.lateral.peak", "env.motors.transversal.peak",
+    "robot.values.latency", "robot.values.motor-friction", "robot.values.paw-friction",
+)  # fmt: skip
+"""Settings that only the start of a training reads; scores of saved checkpoints are of its `best_metric`."""
+RANGES = ("env.randomization.", "robot.randomization.")  # Begins of the names of ranges of robot parameters
+REDRAWN = ("env.randomization.push", "env.randomization.resample-at", "env.randomization.type")
+"""Begins of the names in RANGES that apply during a training in any case."""
 DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's configuration that follow from other settings
 
 
@@ -85,17 +94,32 @@ def saved_init_policy(state: dict[str, Any]) -> str | None:
         return None
 
 
-def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """List the settings that differ between a checkpoint's configuration and `config`, one line `name old -> new` each.
+def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> dict[str, str]:
+    """Return the settings that differ between a checkpoint's configuration and `config`, as text `old -> new` by name.
 
     Empty if the checkpoint has no readable configuration.
     """
     try:
         old, new = _settings(json.loads(state["config"])), _settings(config)
     except DECODE_ERRORS:
-        return []
+        return {}
     changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in changed]
+    return {name: f"{old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in changed}
+
+
+def check_changes(changed: Iterable[str], config: dict[str, Any]) -> None:
+    """Raise InputError if a changed setting is read at the start of a training only, and so would have no effect.
+
+    Such settings are FIXED and, of robots that are nominal or sampled at startup, ranges and startup events.
+    """
+    env, fixed = config["env"], set(FIXED)
+    task = env.get("task", {})
+    if not env.get("randomize") or task.get("randomization", {}).get("resample_at") == "startup":
+        fixed |= {name for name in changed if name.startswith(RANGES) and not name.startswith(REDRAWN)}
+    startup = tuple(f"env.events.{event['name']}." for event in task.get("events", ()) if event["mode"] == "startup")
+    fixed |= {name for name in changed if name.startswith(startup)}
+    if names := [name for name in changed if name in fixed]:
+        raise InputError(f"{', '.join(names)} cannot change after the start of a training")
 
 
 def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:

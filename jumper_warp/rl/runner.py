@@ -168,17 +168,21 @@ class TrainingRun:
         """
         path, state, skipped, _ = checkpoint
         changed = resume.changed_settings(state, self.config)
-        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
+        lines = [f"{name} {change}" for name, change in changed.items()]
+        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *lines]
         self.notes += resume.changed_user_files(state, self.config)
         try:
+            resume.check_changes(changed, self.config)
             local = resume.rank_state(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
             self.seconds = resume.saved_seconds(state)
             resume.set_random_state(local["rng"])
         except DECODE_ERRORS as error:
-            suffix = f" ({', '.join(changed)})" if changed else ""
+            suffix = f" ({', '.join(lines)})" if lines else ""
             raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
+        if "ppo.lr" in changed:
+            self.ppo.lr.fill_(self.cfg.ppo.lr)
         self.iteration = state["iteration"]
         self.config["train"]["init_policy"] = resume.saved_init_policy(state)
         return path.parent.parent
@@ -210,7 +214,8 @@ class TrainingRun:
                 if self.iteration == first_iteration:
                     self._start_clock()
                 is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
-                logs, saves = (self.iteration % each == 0 for each in (cfg.log_interval, cfg.save_interval))
+                saves = self.iteration % cfg.save_interval == 0
+                logs = saves or self.iteration % cfg.log_interval == 0  # a checkpoint's score is of its last iterations
                 if is_last or logs or saves or cfg.stop_on_nan:
                     self._check(log)
                     is_last = is_last or bool(self.failure and self.rank.size == 1)
@@ -330,10 +335,11 @@ class TrainingRun:
             return
         state = {"iteration": self.iteration, "seconds": seconds, **local, "others": others}
         state["config"] = json.dumps(self.config)
-        folder = self.folder / CHECKPOINTS
+        folder, scores = self.folder / CHECKPOINTS, self._scores
         try:
             path = save_checkpoint(folder, state, self._score(), self.cfg.max_checkpoints)
         except OSError as error:
+            self._scores = scores
             if is_last:
                 raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
             log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")

@@ -126,6 +126,38 @@ def test_refuses_settings_that_do_not_fit_the_checkpoint(capsys, run):
     assert code == 2 and "does not fit these settings: " in err[-1] and err[-1].endswith("(num-envs 4 -> 8)")
 
 
+@pytest.fixture(scope="module")
+def startup(tmp_path_factory):
+    """Folder of a training run that samples its robots at startup."""
+    root = tmp_path_factory.mktemp("logs")
+    flags = ["--num-envs", "4", "--max-iterations", "1", "--env.randomization.resample-at", "startup"]
+    cli.main(["train", "vertical-jump", *HERE, *SMALL, *flags, "--log-root", str(root)])
+    return next((root / "vertical-jump").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("flags", "fixed"),
+    [
+        (["--env.randomization.base-mass", "2", "2"], "env.randomization.base-mass"),
+        (["--env.motors.lateral.peak", "20"], "env.motors.lateral.peak"),
+        (["--env.randomization.push-force", "-1", "1", "--env.gravity", "3.71"], None),
+        (["--env.randomization.base-mass", "2", "2", "--env.randomization.resample-at", "reset"], None),
+    ],
+)
+def test_refuses_changes_of_what_is_sampled_at_startup(capsys, startup, tmp_path, flags, fixed):
+    run = shutil.copytree(startup, tmp_path / "run")
+    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", *flags)
+    assert code == (2 if fixed else 0)
+    assert fixed is None or f"does not fit these settings: {fixed} cannot change after the start" in err[-1]
+
+
+def test_refuses_another_latency_of_a_nominal_robot(capsys, run, tmp_path):
+    overlay = json.dumps(config(run)["env"]["robot"] | {"values": {"latency": [0.008]}})
+    (tmp_path / "late.json").write_text(overlay)
+    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--robot", str(tmp_path / "late.json"))
+    assert code == 2 and "robot.values.latency cannot change after the start of a training" in err[-1]
+
+
 def test_refuses_run_of_another_task(capsys, run):
     _, _, err = command(capsys, "train", "horizontal-jump", "--resume", str(run))
     assert "of a run of vertical-jump, not of horizontal-jump" in err[-1]

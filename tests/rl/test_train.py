@@ -460,3 +460,78 @@ def test_saved_score_is_the_mean_of_the_logged_metric_since_the_checkpoint_befor
     means = [(logged[0] + logged[1]) / 2.0, (logged[2] + logged[3]) / 2.0]
     assert [entry["score"] for entry in manifest.values()] == pytest.approx(means)
     assert means[0] != pytest.approx(logged[1])
+
+
+def logged(folder):
+    """Return the logged metrics by iteration, without measured times."""
+    lines = [json.loads(line) for line in (folder / METRICS_FILE).read_text().splitlines()]
+    return {line["iteration"]: {name: x for name, x in line.items() if not name.startswith("Perf/")} for line in lines}
+
+
+def test_iterations_with_a_checkpoint_are_logged_and_scored(cfg):
+    folder = train(dataclasses.replace(cfg, log_interval=3, max_iterations=5), make_env).folder
+    metrics = logged(folder)
+    assert metrics.keys() == {2, 3, 4, 5}
+    manifest = json.loads((folder / CHECKPOINTS / MANIFEST).read_text())
+    success = {iteration: line["Metrics/success"] for iteration, line in metrics.items()}
+    scores = {entry["iteration"]: entry["score"] for entry in manifest.values()}
+    assert scores == {2: success[2], 4: pytest.approx((success[3] + success[4]) / 2.0), 5: success[5]}
+
+
+def test_next_metrics_after_a_resume_are_those_of_an_uninterrupted_training(cfg):
+    cfg = dataclasses.replace(cfg, log_interval=3, max_iterations=6)
+    folder = train(cfg, PushTask).folder
+    expected = logged(folder)
+    checkpoint = folder / CHECKPOINTS / "iteration_000004.pt"
+    assert logged(train(dataclasses.replace(cfg, resume=str(checkpoint)), PushTask).folder) == expected
+
+
+def test_score_of_a_checkpoint_that_could_not_be_saved_counts_for_the_next(cfg):
+    class BlockingTask(PushTask):  # a file is where the checkpoints' folder should go, until the fourth iteration
+        def metrics(self):
+            for folder in cfg.log_root.glob("push/*"):
+                place = folder / CHECKPOINTS
+                place.unlink() if place.is_file() and self.steps > 48 else place.touch()
+            return {"Metrics/success": float(self.steps)}
+
+    folder = train(cfg, BlockingTask).folder
+    manifest = json.loads((folder / CHECKPOINTS / MANIFEST).read_text())
+    assert [entry["score"] for entry in manifest.values()] == [48.0]  # the mean of 32 and 64
+
+
+def resumed_state(cfg, folder, **ppo):
+    """Resume a training with other settings of PPO for no iteration; return its `Ppo` and printed notes."""
+    cfg = dataclasses.replace(cfg, resume=str(folder), ppo=dataclasses.replace(cfg.ppo, **ppo))
+    run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    return run.ppo, run.notes
+
+
+def test_resume_applies_a_changed_learning_rate_and_its_bounds(cfg):
+    folder = train(cfg, make_env).folder
+    saved = float(load_checkpoint(folder / CHECKPOINTS / "iteration_000004.pt")["ppo"]["lr"])
+    assert float(resumed_state(cfg, folder)[0].lr) == saved
+    ppo, notes = resumed_state(cfg, folder, lr=1.0e-5)
+    assert float(ppo.lr) == pytest.approx(1.0e-5) and "ppo.lr 0.001 -> 1e-05" in notes
+    train(dataclasses.replace(cfg, resume=str(folder), max_iterations=5), make_env)  # config.json has the old rate
+    assert float(resumed_state(cfg, folder, lr=0.4 * saved, max_lr=0.5 * saved)[0].lr) == pytest.approx(0.4 * saved)
+    slow = dataclasses.replace(cfg, ppo=dataclasses.replace(cfg.ppo, lr=0.1 * saved))
+    limited = train(slow, make_env).folder
+    state = final_state(train(dataclasses.replace(slow, resume=str(limited)), make_env))
+    save_checkpoint(limited / CHECKPOINTS, state | {"ppo": state["ppo"] | {"lr": torch.tensor(saved)}})
+    assert float(resumed_state(slow, limited, max_lr=0.5 * saved)[0].lr) == pytest.approx(0.5 * saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"ppo": dataclasses.replace(SMALL, init_std=0.1)}, "ppo.init-std"),
+        ({"ppo": dataclasses.replace(SMALL, normalise_value=False)}, "ppo.normalise-value"),
+        ({"best_metric": "Train/mean_reward"}, "best-metric"),
+    ],
+)
+def test_resume_refuses_settings_that_only_the_start_reads(cfg, change, name):
+    folder = train(cfg, make_env).folder
+    before = (folder / CONFIG).read_text()
+    with pytest.raises(CheckpointError, match=f": {name} cannot change after the start of a training"):
+        train(dataclasses.replace(cfg, resume=str(folder), **change), make_env)
+    assert (folder / CONFIG).read_text() == before

@@ -13,8 +13,8 @@ from toy_task import SMALL, PushTask, push_cfg
 
 @pytest.fixture
 def cfg(tmp_path):
-    """Settings of up to 100 iterations of 16 steps; every second one is logged and saved."""
-    return push_cfg(tmp_path / "logs", max_iterations=100)
+    """Settings of up to 100 iterations of 16 steps; every second one is logged."""
+    return push_cfg(tmp_path / "logs", max_iterations=100, save_interval=100)
 
 
 class ClockedTask(PushTask):
