@@ -128,6 +128,8 @@ def _cell(key: str, metric: Mapping[str, Any] | None) -> str:
     """Format a metric as a cell of a table: a rate in per cent, else the value with its unit; empty if undefined."""
     if metric is None or metric["value"] is None:
         return ""
+    if type(metric["value"]) not in (int, float):
+        return str(metric["value"])
     if key.endswith("_rate"):
         return f"{100.0 * metric['value']:.1f} %"
     return f"{metric['value']:#.3g} {metric['unit']}"

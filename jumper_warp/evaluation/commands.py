@@ -261,11 +261,13 @@ def play_dump(cfg: DumpCfg) -> Path:
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
     from jumper_warp.viz.recorder import Recorder
+    from jumper_warp.viz.recording import FARTHEST
 
     configure_device("cpu")
     sim = Simulation(1, device="cpu")
-    sim.state.joint_q.assign(np.nan_to_num(found.arrays["joint_q"], posinf=0.0, neginf=0.0))
-    sim.state.joint_qd.assign(np.nan_to_num(found.arrays["joint_qd"], posinf=0.0, neginf=0.0))
+    q, qd = (np.where(np.abs(x) < FARTHEST, x, 0.0) for x in (found.arrays["joint_q"], found.arrays["joint_qd"]))
+    sim.state.joint_q.assign(q)  # 0 in place of values that are not finite or cannot be drawn
+    sim.state.joint_qd.assign(qd)
     poses = LinkReader(sim).read()[0]
     units = {name: zip(found.names[name], found.arrays[name], strict=True) for name in ("rewards", "observations")}
     series = {f"{group}/{name} [1]": float(value) for group, values in units.items() for name, value in values}

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jumper_warp.policies.manifest import CONFIG, MANIFEST, ONNX, README
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.manifest import CONFIG, MANIFEST, ONNX, README, parse_object, read_files
+from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
-from jumper_warp.utils.files import read_file, read_json
+from jumper_warp.utils.files import read_file
 
 METRICS = "metrics.json"
 PICTURE = "picture.webp"
@@ -51,9 +51,8 @@ class PolicySummary:
     def success(self) -> float | None:
         """Success rate in the first test condition, for walking the rate without a fall; None: not evaluated."""
         rates = [self.metrics[key]["value"] for key in SUCCESSES if key in self.metrics]
-        if not rates and "fall_rate" in self.metrics:
-            return 1.0 - self.metrics["fall_rate"]["value"]
-        return rates[0] if rates else None
+        falls = self.metrics.get("fall_rate", {"value": None})["value"]
+        return rates[0] if rates else None if falls is None else 1.0 - falls
 
     @property
     def error(self) -> dict[str, Any] | None:
@@ -111,23 +110,37 @@ def _no_policy(text: str, path: Path) -> str:
 
 
 def summarise(folder: Path) -> PolicySummary:
-    """Return a policy's metrics and description. Raises PolicyError: it is no policy, or a file is malformed."""
+    """Return a policy's metrics and description, after verifying its files.
+
+    Raises PolicyError: it is no policy, or a file is missing, altered or malformed, or a link to another folder.
+    """
     try:
-        task = read_json(folder / CONFIG, "configuration")["interface"]["task"]
-        size, readme, metrics = (folder / ONNX).stat().st_size, folder / README, folder / METRICS
+        files, readme = read_files(folder).content, folder / README
+        interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG]).get("interface"))
+        if METRICS not in files and os.path.lexists(folder / METRICS):
+            raise PolicyError(f"{METRICS} is not in {MANIFEST}")
+        if os.path.dirname(os.path.realpath(readme)) != os.path.realpath(folder):
+            raise PolicyError(f"{README} is a link to another folder")
         about = first_paragraph(read_file(readme, "page").decode()) if os.path.lexists(readme) else ""
-        saved = read_json(metrics, "metrics") if os.path.lexists(metrics) else {"rows": []}
+        saved = parse_object(folder / METRICS, files[METRICS]) if METRICS in files else {"rows": []}
         rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
-        summary = PolicySummary(folder.resolve().name, folder, str(task), about, size, rows)
-        _ = summary.success, summary.error  # raise KeyError or TypeError for metrics of another format
-        return summary
-    except OSError as error:
-        reason = f"{Path(error.filename or folder).name}: {error.strerror}"
-    except InputError as error:
-        reason = str(error)
+        for row in rows:
+            _check_row(row)
+        return PolicySummary(folder.resolve().name, folder, interface.task, about, len(files[ONNX]), rows)
     except (ValueError, LookupError, TypeError, AttributeError) as error:
-        reason = f"{type(error).__name__}: {error}"
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     raise PolicyError(f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run")
+
+
+def _check_row(row: dict[str, Any]) -> None:
+    """Raise PolicyError, or LookupError or such, unless metrics in one condition are as in docs/metrics.schema.json."""
+    metrics = row["metrics"].values()
+    numbers = [metric["value"] for key, metric in row["metrics"].items() if key in (*SUCCESSES, *ERRORS, "fall_rate")]
+    valid = isinstance(row["condition"], str) and isinstance(row["conditions"], dict) and metrics
+    valid = valid and all(type(number) in (int, float, type(None)) for number in numbers)
+    valid = valid and all(type(metric["trials"]) in (int, type(None)) for metric in metrics)
+    if not valid or not all(isinstance(metric["unit"], str | None) for metric in metrics):
+        raise PolicyError(f"{METRICS}: metrics of another type than docs/metrics.schema.json has")
 
 
 def first_paragraph(markdown: str) -> str:

@@ -1,7 +1,8 @@
 """Folder of the assets: the robot's description and the policies."""
 
-import json
 from pathlib import Path
+
+from jumper_warp.utils.files import read_json
 
 
 def assets_folder(package: Path) -> Path:
@@ -22,4 +23,4 @@ def dashed(name: str) -> str:
 def policy_tasks() -> dict[str, str]:
     """Return the task name of each of the project's policies, by policy name."""
     files = sorted(POLICIES.glob("*/config.json"))
-    return {file.parent.name: json.loads(file.read_bytes())["interface"]["task"] for file in files}
+    return {file.parent.name: read_json(file, "configuration")["interface"]["task"] for file in files}

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
-import zlib
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jumper_warp.utils.arrays import read_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import parse_json, write_atomically
 
 FORMAT, VERSION = "jumper-warp dump", 1
+GROUPS = ("rewards", "observations")  # Arrays of the values of all terms, whose names are in the header
+LABEL = re.compile(r"[\w. -]{1,250}")  # Names of tasks, terms and their components
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
@@ -50,23 +52,24 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
 
 
 def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
-    """Read a non-finite value and the header from a file that `write_dump` has written.
+    """Read a non-finite value and the header from a file that `write_dump` has written in a training.
 
-    Raises InputError: the file is missing, damaged, of another kind or of another version.
+    Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, of another kind or version, or an
+    entry has another type or shape.
     """
+    arrays = read_npz(path, "dump of a training")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name != "header"}
-            header = json.loads(str(archive["header"]))
-        if header["format"] != FORMAT or header["version"] != VERSION:
-            raise InputError(f"{path}: expected a {FORMAT} of version {VERSION}")
-        fits = arrays["joint_q"].shape == (43,) and arrays["joint_qd"].shape == (38,)
-        fits &= all(arrays[name].shape == (len(header["names"][name]),) for name in ("rewards", "observations"))
-        if not fits or arrays["action"].shape != (12,):
-            raise InputError(f"{path}: arrays of another shape than those of a {FORMAT}")
-        place = (float(header["value"]), int(header["world"]), int(header["step"]))
-        return NonFiniteValue(str(header["term"]), *place, arrays, header["names"]), header
-    except InputError:
-        raise
-    except (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        header = parse_json(str(arrays.pop("header")), "header")
+        names, entries = header["names"], [header["term"], header["task"]]
+        entries += [name for group in GROUPS for name in names[group]]
+        counts = [header["world"], header["step"], header["iteration"], header["config"]["train"]["seed"]]
+        shapes = {"joint_q": 43, "joint_qd": 38, "action": 12} | {name: len(names[name]) for name in GROUPS}
+        valid = header["format"] == FORMAT and header["version"] == VERSION
+        valid &= all(LABEL.fullmatch(entry) for entry in entries) and all(type(count) is int for count in counts)
+        valid &= all(values.dtype.kind in "biuf" for values in arrays.values())
+        if not valid or any(arrays[name].shape != (size,) for name, size in shapes.items()):
+            raise InputError(f"expected a {FORMAT} of version {VERSION}")
+        value, world, step = float(header["value"]), header["world"], header["step"]
+        return NonFiniteValue(header["term"], value, world, step, arrays, names), header
+    except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error})") from error

@@ -45,9 +45,12 @@ HARMLESS = {
     },
 }
 """Reason by reader and file or dotted entry, without indices of lists; it holds for the entries inside, too."""
-SYSTEMATIC = ["policy", "manifest", "deploy", "overlay", "script", "npz", "csv", "checkpoint"]
+SYSTEMATIC = [
+    "policy", "manifest", "info", "metrics", "recording", "dump", "deploy", "overlay", "script", "npz", "csv",
+    "checkpoint",
+]  # fmt: skip
 SAMPLED = ["description", "task"]  # larger files, of which mutations are sampled
-CHECKED = ["policy", "deploy", "checkpoint", "npz"]  # with a checksum of each byte
+CHECKED = ["policy", "info", "deploy", "checkpoint", "npz", "recording", "dump"]  # with a checksum of each byte
 LENIENT = ("removed", "doubled", "is object", "is list")  # missing settings of a task have defaults
 COMMON = {"deadline": None, "derandomize": True, "suppress_health_check": list(HealthCheck)}
 

@@ -8,6 +8,8 @@ import pytest
 from cli_helpers import run
 from jumper_warp.cli.info import results_table
 from jumper_warp.policies.catalog import first_paragraph, summarise
+from jumper_warp.policies.folder import add_files, save_policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
 
@@ -22,6 +24,11 @@ def nominal_metrics(name):
     """Return the metrics of the nominal robot in a shipped policy's metrics.json, by key."""
     rows = json.loads((POLICIES / name / "metrics.json").read_text())["rows"]
     return next(row["metrics"] for row in rows if (row["condition"], row["seed"]) == ("nominal", 0))
+
+
+def copy_of(name, folder):
+    """Save a shipped policy without its metrics and pictures to a folder, and return the folder."""
+    return save_policy(folder, load_policy(name))
 
 
 def listed(capsys):
@@ -109,32 +116,47 @@ def test_spelling_decides_between_a_task_and_a_policy_of_one_name(capsys, args, 
 
 
 def test_info_of_a_policy_without_metrics_or_page_shows_its_folder(capsys, tmp_path):
-    folder = tmp_path / "mine"
-    folder.mkdir()
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "attitude" / name, folder / name)
+    folder = copy_of("attitude", tmp_path / "mine")
+    (folder / "README.md").unlink()
     code, out, _ = run(capsys, "info", str(folder))
     assert code == 0 and f"jumper evaluate {folder}" in out and "nominal" not in out
     assert summarise(folder).success is summarise(folder).error is None
 
 
 def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "vertical_jump" / name, tmp_path / name)
+    folder = copy_of("vertical_jump", tmp_path / "mine")
     row = json.loads((POLICIES / "vertical_jump/metrics.json").read_text())["rows"][0]
     saved = {"schema": "jumper-warp metrics", "version": 1, "conditions": row["conditions"], "metrics": row["metrics"]}
-    (tmp_path / "metrics.json").write_text(json.dumps(saved))
-    assert summarise(tmp_path).success == row["metrics"]["success_rate"]["value"]
-    assert "as evaluated   96.7 %" in run(capsys, "info", str(tmp_path))[1]
+    add_files(folder, {"metrics.json": json.dumps(saved).encode()})
+    assert summarise(folder).success == row["metrics"]["success_rate"]["value"]
+    assert "as evaluated   96.7 %" in run(capsys, "info", str(folder))[1]
+
+
+def test_info_refuses_metrics_that_differ_from_the_manifest(tmp_path, capsys):
+    folder = tmp_path / "altered"
+    shutil.copytree(POLICIES / "vertical_jump", folder)
+    text = (folder / "metrics.json").read_text()
+    (folder / "metrics.json").write_text(text.replace('"value": 0.96', '"value": 0.99', 1))
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and "metrics.json: truncated or altered" in err[0]
+
+
+@pytest.mark.parametrize("target", ["../secret.md", "README.md", "/dev/zero"])
+def test_info_refuses_a_page_that_is_a_link_to_another_folder(tmp_path, capsys, target):
+    (tmp_path / "secret.md").write_text("secret")
+    folder = copy_of("attitude", tmp_path / "mine")
+    (folder / "README.md").unlink()
+    (folder / "README.md").symlink_to(target)
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and len(err) == 1 and "README.md" in err[0]
 
 
 @pytest.mark.parametrize(("file", "text"), [("metrics.json", '{"metrics": 3}'), ("config.json", "{}")])
 def test_info_refuses_a_folder_with_malformed_files(tmp_path, capsys, file, text):
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "attitude" / name, tmp_path / name)
-    (tmp_path / file).write_text(text)
-    code, out, err = run(capsys, "info", str(tmp_path))
-    assert (code, out) == (2, "") and len(err) == 1 and f"{tmp_path}: not a policy's folder" in err[0]
+    folder = copy_of("attitude", tmp_path / "mine")
+    (folder / file).write_text(text)
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and len(err) == 1 and f"{folder}: not a policy's folder" in err[0]
 
 
 def test_first_paragraph_is_text_without_markup():

@@ -113,5 +113,5 @@ def test_refuses_a_file_that_is_no_dump(tmp_path):
     path = tmp_path / "other.npz"
     for write in (lambda: None, lambda: path.write_bytes(b"PK"), lambda: np.savez(path, header=np.array("{}"))):
         write()
-        with pytest.raises(InputError, match=r"other\.npz: cannot be read as a dump"):
+        with pytest.raises(InputError, match=r"other\.npz: (no such file|not an npz file|cannot be read as a dump)"):
             load_dump(path)

@@ -20,10 +20,13 @@ from xml.etree import ElementTree
 import numpy as np
 import torch
 
+from box_robot import box_recording, walk
+from jumper_warp.cli.info import policy_info
 from jumper_warp.cli.main import dispatch
 from jumper_warp.deploy.policy import JOINTS, DeployedPolicy
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.identification.motions import RecordedMotion, load_motion
+from jumper_warp.policies.catalog import summarise
 from jumper_warp.policies.folder import add_files, save_policy
 from jumper_warp.policies.onnx import onnx_model
 from jumper_warp.policies.policy import Policy
@@ -35,8 +38,11 @@ from jumper_warp.robot.description import DEFAULT_DESCRIPTION, load_description
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.saving import task_from_json, task_to_json
+from jumper_warp.utils.dumps import NonFiniteValue, load_dump, write_dump
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_json
+from jumper_warp.viz.recording import load_npz
+from jumper_warp.viz.rerun import write_rrd
 
 TETRAHEDRON = "v 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nv 0 0 -0.1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 TASK_FILE = """\
@@ -140,6 +146,91 @@ def policy_reader(folder):
 def manifest_reader(folder):
     """Return the reader of a policy folder for mutations of its manifest."""
     return replace(policy_reader(folder), json_file="manifest.json", sign=lambda files: None)
+
+
+def metrics():
+    """Return valid metrics of an evaluation, as JSON data."""
+    rate = {"value": 0.9, "unit": None, "trials": 10, "interval": [0.6, 0.98], "over": "jumps"}
+    error = {"value": 0.01, "unit": "m", "trials": 10, "interval": None, "over": "jumps"}
+    values = {"success_rate": rate, "apex_error_abs_mean_m": error, "fall_rate": rate}
+    return {"schema": "jumper-warp metrics", "version": 1, "conditions": {"commands": "0.5 m"}, "metrics": values}
+
+
+def info_reader(folder):
+    """Return `jumper info` of a policy folder as a reader; its page has no checksum and is left out."""
+    save_policy(folder, small_policy())
+    add_files(folder, {"metrics.json": json.dumps(metrics()).encode()})
+    (folder / "README.md").unlink()
+
+    def read(where):
+        content, lines = policy_info(summarise(where))
+        return "\n".join([str(content), *lines]).replace(str(where), "FOLDER").replace(where.name, "FOLDER")
+
+    return Reader(files_in(folder), read, json_file="manifest.json")
+
+
+def metrics_reader(folder):
+    """Return `jumper info` as a reader of metrics that the manifest matches; which values it prints does not count."""
+    policy = policy_reader(folder)
+    add_files(folder, {"metrics.json": json.dumps(metrics()).encode()})
+    files = {name: data for name, data in files_in(folder).items() if name != "README.md"}
+
+    def read(where):
+        policy_info(summarise(where))
+
+    return Reader(files, read, policy.sign, "metrics.json")
+
+
+def packed(file, arrays):
+    """Return a function that packs `header.json` among files and `arrays` into an npz `file`."""
+
+    def pack(files):
+        data = io.BytesIO()
+        np.savez_compressed(data, header=np.array(files.pop("header.json").decode()), **arrays)
+        files[file] = data.getvalue()
+
+    return pack
+
+
+def archive_reader(folder, file, read):
+    """Return the reader of an npz in a folder whose header is JSON; `header.json` stands for the header."""
+    with np.load(folder / file) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    header = {"header.json": str(arrays.pop("header")).encode()}
+    files = header | {file: (folder / file).read_bytes()}
+    return Reader(files, lambda where: read(where / file), packed(file, arrays), "header.json", ("header",))
+
+
+def recording_reader(folder):
+    """Return the reader of a recording; which valid names it has does not count."""
+    positions = walk(0.1, 0.1)
+    fields = {"labels": ("a walk",), "states": {"phase": len(positions) * ["walks"]}, "notes": {"task": "walk"}}
+    series = {"base/height [m]": np.zeros(len(positions))}
+    folder.mkdir()
+    box_recording(positions, series=series, goals=np.zeros((1, 1, 3)), **fields).save_npz(folder / "walk.npz")
+
+    def read(path):
+        recording = load_npz(path)
+        write_rrd(recording, path.with_name("walk.rrd"))  # uses all entries
+        return recording.poses.tolist()
+
+    return archive_reader(folder, "walk.npz", read)
+
+
+def dump_reader(folder):
+    """Return the reader of a dump of a training; which valid names and counts it has does not count."""
+    shapes = {"joint_q": 43, "joint_qd": 38, "action": 12, "rewards": 1, "observations": 2}
+    arrays = {name: np.linspace(0.0, 1.0, size) for name, size in shapes.items()}
+    names = {"rewards": ["tilt"], "observations": ["actor.x", "actor.y"]}
+    found = NonFiniteValue("rewards.tilt", math.nan, 3, 17, arrays, names)
+    write_dump(folder / "tilt.npz", found, iteration=3, task="jump", config={"train": {"seed": 11}})
+
+    def read(path):
+        loaded, header = load_dump(path)
+        assert all(len(loaded.names[name]) == len(loaded.arrays[name]) for name in names), header
+        return {name: values.tolist() for name, values in loaded.arrays.items()}
+
+    return archive_reader(folder, "tilt.npz", read)
 
 
 def deploy_reader(folder):
@@ -309,7 +400,8 @@ def checkpoint_reader(folder):
 
 
 READERS = {
-    "policy": policy_reader, "manifest": manifest_reader, "deploy": deploy_reader, "overlay": overlay_reader,
+    "policy": policy_reader, "manifest": manifest_reader, "info": info_reader, "metrics": metrics_reader,
+    "recording": recording_reader, "dump": dump_reader, "deploy": deploy_reader, "overlay": overlay_reader,
     "description": description_reader, "script": script_reader, "npz": npz_reader, "csv": csv_reader,
     "parquet": parquet_reader, "module": module_reader, "task": task_reader, "checkpoint": checkpoint_reader,
 }  # fmt: skip
