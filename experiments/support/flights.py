@@ -18,7 +18,7 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
-from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
+from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_config
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
@@ -265,10 +265,10 @@ class FlightRun(Run):
         self.turn: Policy = open_policy(args.policy)
         self.landing: Policy | None = open_policy(landing) if landing else None
         turning = restored_task(self.turn.config)
-        if turning.evaluation_suite != "attitude":
+        if turning.evaluation.kind != "attitude":
             raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
         takes_off = make_task(jump) if self.landing is None else restored_task(self.landing.config)
-        if takes_off.evaluation_suite not in HEIGHTS:
+        if takes_off.evaluation.kind != "height":
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.num_recorded)

@@ -42,5 +42,5 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    cfg = parse("play", saved_task(policy, modules), args, PlayCfg, lambda kind: kind.play)
+    cfg = parse("play", saved_task(policy, modules), args, PlayCfg)
     play(open_run(policy, modules), cfg)
