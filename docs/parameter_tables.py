@@ -18,7 +18,6 @@ from jumper_warp.robot.description import leg_dimensions, load_description
 from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, standing_configuration
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START, LimitsCfg
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.commands import layout_of
 from jumper_warp.tasks.randomization import MEAN_FRICTION, NOMINAL_FRICTION, RandomizationCfg
 
 DOCS = Path(__file__).parent
@@ -206,7 +205,7 @@ def randomisation() -> str:
 
 def commands() -> str:
     """Return the numbers of a command by task."""
-    return table("task | numbers of a row", grouped(lambda task: (str(layout_of(task)),)))
+    return table("task | numbers of a row", grouped(lambda task: (str(task.command),)))
 
 
 TABLES = {each.__name__: each for each in (body, motors, passive, tasks, filters, randomisation, commands)}

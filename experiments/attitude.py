@@ -21,6 +21,7 @@ import numpy as np
 
 from jumper_warp.evaluation.attitude import DIRECTIONS, TURN_METRICS, AttitudeFlags, AttitudeLog, random_turns
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.tasks.attitude.cfg import AttitudeEvaluation
 from jumper_warp.utils.metrics import measure
 from jumper_warp.viz.plots import figure
 from support.momentum import MomentumRecorder, rotational_inertia
@@ -65,7 +66,7 @@ def plot_turns(run: EvaluationRun, turns: AttitudeLog, conditions: str) -> None:
 
 def main(args: Args) -> dict:
     """Run turns about body axes and about random axes, write plots and recording, and return the metrics."""
-    run = EvaluationRun.from_args("attitude", args, ("attitude",))
+    run = EvaluationRun.from_args("attitude", args, AttitudeEvaluation)
     env = run.env(args.num_turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.settings |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, momentum = args.log(run.task, args.stream_seed), MomentumRecorder(env)

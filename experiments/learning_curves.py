@@ -52,8 +52,8 @@ class Args(DeviceArgs):
     randomize: bool = False  # Train with randomisation and noise
 
     def __post_init__(self) -> None:
-        if (suite := make_task(self.task).evaluation_suite) not in TEST_RANGES:
-            raise InputError(f"{self.task} is no jump: its evaluation is {suite}")
+        if (kind := make_task(self.task).evaluation.kind) not in TEST_RANGES:
+            raise InputError(f"{self.task} is no jump: its evaluation is {kind}")
         for name in self.variants:
             variant(trainer_settings(self.task), name)
         if not self.variants or not self.seeds or min(self.seeds) < 0:
@@ -83,7 +83,7 @@ def main(args: Args) -> dict[str, Any]:
     folder = prepare("learning_curves", args)
     length = {"iterations": args.iterations} if args.iterations else {"seconds": args.seconds}
     values: dict[str, Any] = {"task": args.task, **length, "envs": args.num_envs, "randomize": args.randomize}
-    limits = args.goal_range or TEST_RANGES[make_task(args.task).evaluation_suite]
+    limits = args.goal_range or TEST_RANGES[make_task(args.task).evaluation.kind]
     values |= {"seeds": list(args.seeds), "goals_m": list(limits), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
     runs = [*itertools.product(args.variants, args.seeds)]

@@ -25,6 +25,7 @@ import torch
 import tyro
 
 from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
+from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.assets import policy_tasks
@@ -95,7 +96,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
         folder.mkdir(parents=True, exist_ok=True)
         payload_overlay(run.recipe.robot, payload).save(values["robot"])
     conditions = Conditions(**values, seed=seed, device=args.device, threads=args.threads)
-    flags = with_trials(run.evaluation.flags, args.trials)
+    flags = with_trials(default_flags(run.evaluation, "evaluate"), args.trials)
     run.settings["commands"] = commands_of(flags)
     with contextlib.redirect_stdout(io.StringIO()):
         return evaluate(run, EvaluateCfg(flags, conditions, folder))

@@ -39,7 +39,7 @@ def main(args: Args) -> dict:
     folder, paper = output_dir("paper_tests", args.out), {}
     metrics: Metrics = {}
     for policy in args.policies:
-        for name, suite in suites_for(EvaluationRun(policy).task.evaluation_suite).items():
+        for name, suite in suites_for(EvaluationRun(policy).task).items():
             if not suite.paper:
                 continue
             flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}

@@ -67,7 +67,7 @@ class Args(ThreadArgs):
         """Yield (task, ablation or "full", seed) of each training: all trainings with the first seed, then the next."""
         for seed in self.seeds:
             for name in self.tasks:
-                walks = make_task(name).evaluation_suite == "velocity"
+                walks = make_task(name).evaluation.kind == "velocity"
                 yield from ((name, arm, seed) for arm in self.arms if arm == FULL or not walks)
 
     def command(self, name: str, arm: str, seed: int, folder: Path) -> list[str]:
@@ -81,7 +81,7 @@ class Args(ThreadArgs):
 
 def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[str, Any]:
     """Train and test a task with an ablation (arm) and a seed, unless `folder` has the results; return them by name."""
-    primary = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation_suite]}"
+    primary = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation.kind]}"
     jumps = not primary.startswith(f"{NOMINAL}_walk")
     if (folder / "metrics.json").exists() and (values := read_values(folder)).get(primary) is not None:
         return values
@@ -109,7 +109,7 @@ def main(args: Args) -> dict[str, Any]:
     folder, results = prepare("paper_trainings", args, args.threads), {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")
-        key = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation_suite]}"
+        key = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation.kind]}"
         results[f"{name}_{arm}_{seed}"] = values[key]
         announce(f"{name}, {arm}, seed {seed}: {key.replace('_', ' ')} {values[key]:.3g}")
     plot_curves(folder, folder / "curves.webp")

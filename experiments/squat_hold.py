@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.tasks.jump.evaluation import JumpEvaluation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
@@ -62,9 +63,9 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
 
 def main(args: Args) -> dict:
     """Simulate the held squats, plot them unless all robots fall, and return the metrics."""
-    run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
+    run = EvaluationRun.from_args("squat_hold", args, JumpEvaluation)
     env = run.env(args.num_squats)
-    up = run.task.evaluation_suite in HEIGHTS
+    up = run.evaluation.kind == "height"
     goals = squat_goals(args.num_squats, args.height if up else args.distance, up=up)
     squats = run.run_episodes(env, SquatLog(goals, args.hold_time), film="holds")
     if not squats.ended.all():

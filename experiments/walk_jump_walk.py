@@ -22,8 +22,8 @@ from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_cours
 from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.velocities import PAPER
 from jumper_warp.policies.skills import SkillNames
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from support.scripts import run_script
 
@@ -34,7 +34,7 @@ COMMANDS = 10  # Number of commands in a course
 JUMPS = ("jump_up", "jump_to", "jump_onto")  # Kinds of `ScriptStep`
 SUMMARY = (
     "finished_rate", "finished_on_goal_rate", "fall_rate", "apex_error_abs_mean_m", "goal_distance_at_handover_mean_m",
-    *(f"settled_{key}" for key in PAPER),
+    *(f"settled_{key}" for key in VelocityEvaluation.published),
 )  # fmt: skip
 PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turning and each of the jumps
 
@@ -104,7 +104,7 @@ def main(args: Args) -> dict:
     course.warn_beyond_training(run.skills.tasks)
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
-    paper = {} if args.course else {f"settled_{key}": value for key, value in PAPER.items()}
+    paper = {} if args.course else {f"settled_{key}": value for key, value in VelocityEvaluation.published.items()}
     return run.report(course_metrics(course), paper, SUMMARY)
 
 

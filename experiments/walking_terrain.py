@@ -18,6 +18,7 @@ from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean, rate
 from jumper_warp.viz.plots import figure
@@ -49,7 +50,7 @@ class Args(EvaluationArgs):
 
 def main(args: Args) -> dict:
     """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
-    run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
+    run = EvaluationRun.from_args("walking_terrain", args, VelocityEvaluation)
     commands, metrics, fractions = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
     steps = (args.step_height, args.step_height)
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=steps, seed=args.stream_seed)

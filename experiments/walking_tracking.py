@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import AXES, PAPER, VelocityFlags, VelocityLog, check_velocity_settings
+from jumper_warp.evaluation.velocities import AXES, VelocityFlags, VelocityLog, check_velocity_settings
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue, rate
 from jumper_warp.viz.plots import figure
@@ -42,6 +43,7 @@ from support.walks import (
 )  # fmt: skip
 
 GAIT_SPEED = 0.8  # [m/s] Speed of the straight walk whose gait is measured
+PAPER = VelocityEvaluation.published
 SUMMARY = (*PAPER, "fall_rate", "settling_time_median_s", "top_ahead_m_s", "kicked_fall_rate", "cost_of_transport")
 
 
@@ -86,7 +88,8 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
 def main(args: Args) -> dict:
     """Run all tests of walking, plot tracking and settling times, and return the metrics."""
-    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.stream_seed)
+    run = EvaluationRun.from_args("walking_tracking", args, VelocityEvaluation)
+    rng = np.random.default_rng(args.stream_seed)
     flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
     log = flags.log(run.task, args.stream_seed)
     walks, env = run.run_episodes(run.env(log.count), log), run.env(args.commands_per_axis**3)

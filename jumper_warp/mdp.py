@@ -12,13 +12,14 @@
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
 
 Stock terms are in the namespaces `rewards`, `terminations`, `observations` and `events`; `events` also has the
-functions with which an event writes a world's parameters. Jumps use `jumping_motors` and `vertical_jump_filter`, walks
-`walking_motors` and `walking_filter`; other motors and command filters are in `jumper_warp.robot.motors`.
+functions with which an event writes a world's parameters. `mirror` has mirror images of common observations. Jumps use
+`jumping_motors` and `vertical_jump_filter`, walks `walking_motors` and `walking_filter`; other motors and command
+filters are in `jumper_warp.robot.motors`.
 """
 
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState, commanded, waiting
-from jumper_warp.kernels.mdp import observations, rewards, terminations
+from jumper_warp.kernels.mdp import mirror, observations, rewards, terminations
 from jumper_warp.kernels.mdp import parameters as events
 from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
@@ -29,6 +30,7 @@ from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter, walking_filter, walking_motors
 from jumper_warp.tasks.cfg import Command, Handover, ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.evaluation import EpisodeEvaluation, EpisodeMetric
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import (
     Advance,
@@ -41,11 +43,12 @@ from jumper_warp.tasks.terms import (
 )
 
 __all__ = [
-    "FLIGHT", "LANDED", "STANCE", "Advance", "AttitudeState", "Command", "Curriculum", "EventTerm", "Ground",
-    "Handover", "JumpState", "NoSettings", "ObservationTerm", "ObservationsCfg", "RandomizationCfg", "Reset",
-    "RewardTerm", "RngStream", "RobotArrays", "RobotParameters", "RobotView", "Scene", "SkillSettings",
-    "StateMetric", "TaskCfg", "TerminationTerm", "VelocityState", "clamped_normal", "commanded", "events",
-    "fold_in", "jumping_motors", "observations", "rewards", "surface", "terminations", "tilt", "uniform",
-    "uniform_range", "vec12", "vertical_jump_filter", "waiting", "walking_filter", "walking_motors", "world_ground",
+    "FLIGHT", "LANDED", "STANCE", "Advance", "AttitudeState", "Command", "Curriculum", "EpisodeEvaluation",
+    "EpisodeMetric", "EventTerm", "Ground", "Handover", "JumpState", "NoSettings", "ObservationTerm",
+    "ObservationsCfg", "RandomizationCfg", "Reset", "RewardTerm", "RngStream", "RobotArrays", "RobotParameters",
+    "RobotView", "Scene", "SkillSettings", "StateMetric", "TaskCfg", "TerminationTerm", "VelocityState",
+    "clamped_normal", "commanded", "events", "fold_in", "jumping_motors", "mirror", "observations", "rewards",
+    "surface", "terminations", "tilt", "uniform", "uniform_range", "vec12", "vertical_jump_filter", "waiting",
+    "walking_filter", "walking_motors", "world_ground",
     "write_default_pose", "yaw_of",
 ]  # fmt: skip

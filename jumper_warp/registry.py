@@ -110,6 +110,7 @@ HEIGHTS = PpoCfg(gamma=0.99)  # Training of vertical jumps
 ON_MARS = replace(HEIGHTS, symmetry="actor")
 """PPO settings for vertical jumps on Mars, with symmetry: in long flights even a slow rotation turns the robot far."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
+SCORE = "Metrics/score"  # Key of the log by which checkpoints of walks are selected
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 PAPER = PpoCfg(asymmetric_critic=False, final_desired_kl=0.01)
 """Settings of PPO that the paper's tasks share, from the authors' public code."""
@@ -123,70 +124,43 @@ LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 1 --ppo
 LAPTOP_WALK = f"{NOMINAL} --num-envs 512 --ppo.desired-kl 0.02 --ppo.minibatches 4"
 # Numbers of iterations in presets are those of 330, 650 and 1,110 s at 20,000 steps per second.
 
+UP, AHEAD, MARS, PRINTED = (f"jumper_warp.tasks.jump.{name}:" for name in ("vertical", "horizontal", "mars", "paper"))
+WALK = "jumper_warp.tasks.velocity"
+
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",), about="jump to a height",
+        f"{UP}vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",), about="jump to a height",
         presets={
             "laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --ppo.entropy-coef 0.0003 --max-iterations 200"
         },
     ),
     "horizontal-jump": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",),
-        about="jump to a place ahead",
+        f"{AHEAD}horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",), about="jump to a place ahead",
         presets={"laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --max-iterations 400"},
     ),
-    "horizontal-jump-slippery": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:horizontal_jump_slippery", PLACES, about="jump on slippery ground",
-    ),
-    "horizontal-jump-sighted": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:horizontal_jump_sighted", PLACES, about="jump off and onto blocks",
-    ),
-    "omnidirectional-jump": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PLACES, about="jump in any direction",
-    ),
-    "vertical-jump-mars": TaskEntry(
-        "jumper_warp.tasks.jump.mars:vertical_jump_mars", ON_MARS, ("Olympus-Vertical-Jump-Mars",),
-        about="jump to a height, Mars",
-    ),
-    "vertical-jump-mars-loose": TaskEntry(
-        "jumper_warp.tasks.jump.mars:vertical_jump_mars_loose", ON_MARS, about="jump up to 3.6 m, Mars",
-    ),
-    "horizontal-jump-mars": TaskEntry(
-        "jumper_warp.tasks.jump.mars:horizontal_jump_mars", PLACES, ("Olympus-Jump-Mars",),
-        about="jump to a place, Mars",
-    ),
-    "horizontal-jump-mars-loose": TaskEntry(
-        "jumper_warp.tasks.jump.mars:horizontal_jump_mars_loose", PLACES, about="jump farther, Mars",
-    ),
+    "horizontal-jump-slippery": TaskEntry(f"{AHEAD}horizontal_jump_slippery", PLACES, about="jump on slippery ground"),
+    "horizontal-jump-sighted": TaskEntry(f"{AHEAD}horizontal_jump_sighted", PLACES, about="jump off and onto blocks"),
+    "omnidirectional-jump": TaskEntry(f"{AHEAD}omnidirectional_jump", PLACES, about="jump in any direction"),
+    "vertical-jump-mars": TaskEntry(f"{MARS}vertical_jump_mars", ON_MARS, ("Olympus-Vertical-Jump-Mars",),
+                                    about="jump to a height, Mars"),
+    "vertical-jump-mars-loose": TaskEntry(f"{MARS}vertical_jump_mars_loose", ON_MARS, about="jump up to 3.6 m, Mars"),
+    "horizontal-jump-mars": TaskEntry(f"{MARS}horizontal_jump_mars", PLACES, ("Olympus-Jump-Mars",),
+                                      about="jump to a place, Mars"),
+    "horizontal-jump-mars-loose": TaskEntry(f"{MARS}horizontal_jump_mars_loose", PLACES, about="jump farther, Mars"),
     "velocity-flat": TaskEntry(
-        "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score",
-        "walk on level ground",
+        f"{WALK}.flat:velocity_flat", WALKING, ("Olympus-Walk",), SCORE, "walk on level ground",
         {"laptop": f"{LAPTOP_WALK} --ppo.final-desired-kl 0.001 --ppo.entropy-coef 0.006 --max-iterations 1800"},
     ),
-    "velocity-rough": TaskEntry(
-        "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score",
-        about="walk on rough ground",
-    ),
-    "velocity-trot": TaskEntry(
-        "jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score",
-        about="trot on level ground",
-    ),
-    "vertical-jump-paper": TaskEntry(
-        "jumper_warp.tasks.jump.paper:vertical_jump_paper", PAPER_HEIGHTS, about="jump to a height, as in the paper",
-        num_envs=4096, max_iterations=4000,
-    ),
-    "horizontal-jump-paper": TaskEntry(
-        "jumper_warp.tasks.jump.paper:horizontal_jump_paper", PAPER_PLACES, about="jump to a place, as in the paper",
-        num_envs=4096, max_iterations=4000,
-    ),
-    "velocity-paper": TaskEntry(
-        "jumper_warp.tasks.velocity.paper:velocity_paper", PAPER_WALKING, best_metric="Metrics/score",
-        about="walk as in the paper", num_envs=4096, max_iterations=2000,
-    ),
-    "attitude": TaskEntry(
-        "jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled",
-        about="turn while floating",
-    ),
+    "velocity-rough": TaskEntry(f"{WALK}.rough:velocity_rough", WALKING, (), SCORE, "walk on rough ground"),
+    "velocity-trot": TaskEntry(f"{WALK}.flat:velocity_trot", WALKING, (), SCORE, "trot on level ground"),
+    "vertical-jump-paper": TaskEntry(f"{PRINTED}vertical_jump_paper", PAPER_HEIGHTS, num_envs=4096, max_iterations=4000,
+                                     about="jump to a height, as in the paper"),
+    "horizontal-jump-paper": TaskEntry(f"{PRINTED}horizontal_jump_paper", PAPER_PLACES, num_envs=4096,
+                                       max_iterations=4000, about="jump to a place, as in the paper"),
+    "velocity-paper": TaskEntry(f"{WALK}.paper:velocity_paper", PAPER_WALKING, (), SCORE, "walk as in the paper",
+                                num_envs=4096, max_iterations=2000),
+    "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, (), "Metrics/settled",
+                          "turn while floating"),
 }  # fmt: skip
 """Registered tasks by name: those of the project, of the user, and of installed packages once loaded."""
 

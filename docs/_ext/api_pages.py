@@ -23,10 +23,10 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "robot.terrain", "robot.gravity", "robot.export",
     )),
     "tasks": ("Tasks", (
-        "registry", "tasks.jump.cfg", "tasks.jump.vertical", "tasks.jump.horizontal", "tasks.jump.mars",
-        "tasks.velocity.cfg", "tasks.velocity.flat", "tasks.velocity.rough", "tasks.attitude.cfg",
-        "tasks.attitude.flight", "tasks.commands", "tasks.interface", "tasks.switching", "tasks.observations",
-        "tasks.mirror", "tasks.saving",
+        "registry", "tasks.evaluation", "tasks.jump.cfg", "tasks.jump.evaluation", "tasks.jump.vertical",
+        "tasks.jump.horizontal", "tasks.jump.mars", "tasks.velocity.cfg", "tasks.velocity.flat",
+        "tasks.velocity.rough", "tasks.attitude.cfg", "tasks.attitude.flight", "tasks.interface", "tasks.switching",
+        "tasks.observations", "tasks.mirror", "tasks.saving",
     )),
     "gradients": ("Gradients", (
         "diff.rollout", "diff.torch_rollout", "diff.closed_loop",

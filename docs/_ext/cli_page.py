@@ -20,7 +20,7 @@ from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
-from jumper_warp.evaluation.evaluations import EVALUATIONS
+from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import make_task
 from plain_text import to_markdown
@@ -40,15 +40,16 @@ FULL_LIST = 10  # Largest number of flags without a second list
 
 def cli_page() -> str:
     """Return the Markdown of the command reference: a section for each command, then completion and exit codes."""
-    train = settings_of("train")[0]
+    train, stock = settings_of("train")[0], stock_evaluations()
     parts = [
         section("train TASK", COMMANDS["train"], list_flags(train), headings={"Common flags": SHORT_HELP},
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
-        of_kinds("play", ABOUT_PLAY, {name: list_flags(PlayCfg(kind.play)) for name, kind in EVALUATIONS.items()},
+        of_kinds("play", ABOUT_PLAY,
+                 {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
                  {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg)}),
         of_kinds("evaluate", ABOUT_EVALUATE,
-                 {name: list_flags(EvaluateCfg(kind.flags)) for name, kind in EVALUATIONS.items()},
+                 {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),

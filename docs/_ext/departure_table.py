@@ -34,7 +34,7 @@ BASES = {
 }  # fmt: skip
 """Task whose numbers a variant has, except in its own rows; empty: none."""
 TRAINING = ("num_envs", "max_iterations", "ppo")
-SKIPPED = ("name", "state", "command", "metrics", "evaluation_suite", "ppo.tf32", "ppo.graphs",
+SKIPPED = ("name", "state", "command", "metrics", "evaluation", "ppo.tf32", "ppo.graphs",
            "ppo.fused")  # fmt: skip
 """Settings without an effect on what is learnt."""
 

@@ -59,7 +59,9 @@ PAGES = {
         Section("Scene and ground", ("Scene", "Ground", "Block", "surface", "world_ground")),
     )),
     "observations": Page("Observations", "An observation term returns a number or a vector: a part of the network's "
-                         "input.", (Section("Classes", ("ObservationTerm", "ObservationsCfg")),)),
+                         "input. The namespace `mirror` has mirror images: `VECTOR` and `ROTATION` of x, y, z in body "
+                         "axes, `LEGS` of four and `MOTORS` of twelve columns.",
+                         (Section("Classes", ("ObservationTerm", "ObservationsCfg")),)),
     "rewards": Page("Rewards", "A reward term returns a number. Each policy step adds weight × number × 1/60 s to the "
                     "reward.", (Section("Classes", ("RewardTerm",)),)),
     "terminations": Page("Terminations", "A termination term returns whether the episode ends.",
@@ -75,7 +77,9 @@ PAGES = {
         Section("Parameters of a robot", ("RobotParameters", "MotorArrays", "FilterParams", "Limits")),
     )),
     "curricula": Page("Curricula and metrics", "A curriculum raises the level of a robot after successes. A metric is "
-                      "logged as its mean.", (Section("Classes", ("Curriculum", "StateMetric")),)),
+                      "logged as its mean. An evaluation has the metrics and the goal marker of `jumper evaluate` and "
+                      "`play`.", (Section("Classes", ("Curriculum", "StateMetric", "EpisodeEvaluation",
+                                                      "EpisodeMetric")),)),
 }  # fmt: skip
 """Pages by file name."""
 

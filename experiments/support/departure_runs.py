@@ -6,7 +6,7 @@ import json
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -14,7 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from jumper_warp.cli.train import parse_train
-from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
+from jumper_warp.evaluation.evaluations import default_flags
+from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
@@ -100,10 +101,11 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
     for test, count in zip(TESTS, args.num_jumps, strict=True):
         randomize = test == "randomized"
         conditions = replace(run.conditions, randomize=randomize, noise=randomize)
-        flags: Any = replace(cast(Any, run.evaluation.flags), num_jumps=count, **JUMP_TASKS[args.task].goals)
+        flags = default_flags(run.evaluation, "evaluate")
+        flags = replace(flags, num_jumps=count, **JUMP_TASKS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.prepare_task(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
-        up = run.task.evaluation_suite in HEIGHTS
+        up = run.evaluation.kind == "height"
         values["error_m"] = values["apex_error_abs_mean_m" if up else "goal_distance_at_end_mean_m"]
         goals = squat_goals(args.num_squats, JUMP_TASKS[args.task].squats, up=up)
         values |= squat_metrics(

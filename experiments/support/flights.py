@@ -18,7 +18,7 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
-from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
+from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.conditions import shared_robot
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
@@ -265,13 +265,13 @@ class FlightRun(Run):
         self.landing: Policy | None = open_policy(landing) if landing else None
         self.recipes = {"the turning policy": self.turn.recipe()}
         turning = self.recipes["the turning policy"].tested_task(randomize=False)
-        if turning.evaluation_suite != "attitude":
+        if turning.evaluation.kind != "attitude":
             raise PolicyError(f"this needs a policy that turns in flight, {args.policy} is of {turning.name}")
         takes_off = make_task(jump)
         if self.landing is not None:
             self.recipes["the landing policy"] = recipe = self.landing.recipe()
             takes_off = recipe.tested_task(randomize=False)
-        if takes_off.evaluation_suite not in HEIGHTS:
+        if takes_off.evaluation.kind != "height":
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.num_recorded)

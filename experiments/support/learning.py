@@ -27,8 +27,8 @@ from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported
 EVALUATIONS = 40  # Number of evaluations of a training with a given number of iterations
-TEST_RANGES = {"apex_height": (0.5, 1.1), "landing_position": (0.3, 1.5)}
-"""Default ranges [m] of the heights, or distances ahead, of evaluated jumps by the task's `evaluation_suite`."""
+TEST_RANGES = {"height": (0.5, 1.1), "place": (0.3, 1.5)}
+"""Default ranges [m] of the heights, or distances ahead, of evaluated jumps by `Evaluation.kind`."""
 
 
 @dataclass
@@ -71,9 +71,9 @@ def success_rate(trainer: Ppo, eval_env: Env, limits: tuple[float, float] | None
 
     limits [m]: lowest and highest height or distance; None: those of TEST_RANGES.
     """
-    suite, count = eval_env.task.evaluation_suite, eval_env.num_envs
-    limits = limits or TEST_RANGES[suite]
-    goals = places_ahead(limits, count) if suite == "landing_position" else np.linspace(*limits, count)
+    kind, count = eval_env.task.evaluation.kind, eval_env.num_envs
+    limits = limits or TEST_RANGES[kind]
+    goals = places_ahead(limits, count) if kind == "place" else np.linspace(*limits, count)
     return float(run_jumps(trainer.model.act, eval_env, goals).success.mean())
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.cli.train import parse_train
-from jumper_warp.evaluation.evaluations import EVALUATIONS
+from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun
@@ -36,9 +36,9 @@ WALK = ((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (0.4, 0.0, 0.4), (0.0, 0.4, 0.0), (-0.
 COMMAND_TIME = 3.0  # [s] Time of each command of `WALK`
 OFF = 1.0e6  # [m] Tolerance of a termination that never ends an episode
 NOMINAL, RANDOMIZED = "nominal", "randomized"
-PRIMARY = {"apex_height": "sweep_goal_reached_rate", "landing_position": "straight_goal_reached_rate",
+PRIMARY = {"height": "sweep_goal_reached_rate", "place": "straight_goal_reached_rate",
            "velocity": "walk_slewed_rmse_vx_m_s"}  # fmt: skip
-"""Primary metric of nominal robots at the end, by the task's `evaluation_suite`."""
+"""Primary metric of nominal robots at the end, by `Evaluation.kind`."""
 RATE = 0.5  # [1] Success rate whose number of steps is the second primary metric of jumps
 
 
@@ -106,14 +106,14 @@ def make_log(task: TaskCfg, test: str, num_jumps: int) -> EvaluationLog:
 
 def names_of_tests(task: TaskCfg) -> tuple[str, ...]:
     """Return the names of the paper's tests of a task, the primary one first."""
-    return {"apex_height": ("sweep",), "landing_position": ("straight", "grid")}.get(task.evaluation_suite, ("walk",))
+    return {"height": ("sweep",), "place": ("straight", "grid")}.get(task.evaluation.kind, ("walk",))
 
 
 def metrics_of(run: EvaluationRun, log: EvaluationLog) -> Metrics:
     """Return the metrics of a finished test."""
     if isinstance(log, VelocityLog):
         return measure(VELOCITY_METRICS, log)
-    return EVALUATIONS[run.task.evaluation_suite].flags.metrics(log)
+    return default_flags(run.evaluation, "evaluate").metrics(log)
 
 
 def evaluate_arm(checkpoint: Path, folder: Path, num_jumps: int, conditions: Conditions) -> Metrics:
@@ -138,7 +138,7 @@ def learning_curve(run_folder: Path, num_jumps: int, conditions: Conditions) -> 
     run.prepare("paper_trainings", conditions, run_folder)
     test = names_of_tests(run.task)[0]
     env = run.env(make_log(run.task, test, num_jumps).count)
-    key = PRIMARY[run.task.evaluation_suite].removeprefix(f"{test}_")
+    key = PRIMARY[run.evaluation.kind].removeprefix(f"{test}_")
     curve: dict[str, list[float]] = {"iterations": [], "values": []}
     for checkpoint in checkpoints:
         policy, log = open_policy(checkpoint), make_log(env.task, test, num_jumps)

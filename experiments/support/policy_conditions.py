@@ -47,7 +47,7 @@ CONDITIONS = {
 def undefined(task: TaskCfg, name: str) -> str | None:
     """Return the reason why a condition of CONDITIONS is undefined for a task, None if it is defined."""
     randomization = task.randomization
-    if name == "friction_0.4" and task.evaluation_suite == "attitude":
+    if name == "friction_0.4" and task.evaluation.kind == "attitude":
         return "the robot floats and touches no ground"
     if name == "push_in_flight" and randomization.push_force is None and randomization.push_torque is None:
         return "its randomisation has no pushes"

@@ -6,9 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jumper_warp.evaluation.attitude import HARDWARE_TIME, TURN_METRICS
-from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS, PLACE_METRICS
-from jumper_warp.evaluation.run import HEIGHTS
 from jumper_warp.evaluation.velocities import AXES, UNITS, VELOCITY_METRICS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.metrics import MetricValue, unit_of
@@ -79,38 +77,38 @@ MAIN = {
     "attitude": tuple(column._replace(interval=False) for column in COLUMNS["attitude"]),
 }  # fmt: skip
 """Rows of a policy's main table by `kind_of` its task."""
-SIMULATION = {"apex_height": "paper, simulation", "landing_position": "paper, simulation",
+SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
               "velocity": "paper, robot, commands by a person"}  # fmt: skip
-"""Words for `Evaluation.paper` by `TaskCfg.evaluation_suite`."""
+"""Words for `Evaluation.paper` by `Evaluation.kind`."""
 ROBOT: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
-    "apex_height": (
+    "height": (
         ("paper, robot, three jumps to 0.75 m", {"apex_error_abs_mean_m": 0.023}),
         ("paper, robot, one jump to 1 m", {"apex_error_abs_mean_m": 0.01, "apex_error_signed_mean_m": 0.01}),
     ),
-    "landing_position": (
+    "place": (
         ("paper, robot, one jump to 1.25 m", {"goal_distance_at_rest_mean_m": 0.004}),
         ("paper, robot, two jumps to 0.75 m, 0.35 m aside", {"goal_distance_at_rest_mean_m": 0.0015}),
         ("paper, robot, jumps to 0.85 m, 0.1 m aside", {"goal_distance_at_rest_mean_m": 0.005}),
     ),
     "attitude": (("authors' robot, turn by 90°", {"settling_time_mean_s": HARDWARE_TIME}),),
 }  # fmt: skip
-"""Published values of the real robot that no evaluation prints, by `TaskCfg.evaluation_suite`."""
+"""Published values of the real robot that no evaluation prints, by `Evaluation.kind`."""
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
 KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
 
 
 def published(task: TaskCfg) -> list[tuple[str, dict[str, MetricValue]]]:
     """Return the published results of a task, each as a description and its metrics by key."""
-    suite = task.evaluation_suite
-    known = [(SIMULATION[suite], EVALUATIONS[suite].paper)] if suite in SIMULATION else []
+    evaluation = task.evaluation
+    kind = evaluation.kind if evaluation == type(evaluation)() else ""  # else other tests than the published ones
+    known = [(SIMULATION[kind], evaluation.paper)] if kind in SIMULATION else []
     return [(words, {key: MetricValue(value) for key, value in values.items()})
-            for words, values in (*known, *ROBOT.get(suite, ()))]  # fmt: skip
+            for words, values in (*known, *ROBOT.get(kind, ()))]  # fmt: skip
 
 
 def kind_of(task: TaskCfg) -> str:
     """Return the kind of a task that selects the columns of its table, a key of COLUMNS."""
-    suite = task.evaluation_suite
-    return suite if suite in COLUMNS else "height" if suite in HEIGHTS else "place"
+    return task.evaluation.kind
 
 
 def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:

@@ -22,7 +22,6 @@ from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import check_not_negative
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
@@ -235,7 +234,7 @@ def rebuild_growth(make: Callable[[], Env], args: SoakArgs) -> dict[str, int]:
 
     def reset(i: int) -> None:
         """Begin an evaluation's episode; all components of its command are 1."""
-        env.evaluation_reset(np.ones(layout_of(env.task).counts[0]))
+        env.evaluation_reset(np.ones(env.task.command.counts[0]))
         steps(env)
 
     return {

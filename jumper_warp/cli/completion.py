@@ -80,14 +80,15 @@ def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
     from jumper_warp.cli import doctor, export, info, list, sysid, train
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
-    from jumper_warp.evaluation.evaluations import EVALUATIONS
+    from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
 
+    stock = stock_evaluations().values()
     return {
         "train": [train.TrainArgs],
         "finetune": [FinetuneArgs],
-        "play": [*(PlayCfg(kind.play) for kind in EVALUATIONS.values()), ScriptCfg, DumpCfg],
-        "evaluate": [EvaluateCfg(kind.flags) for kind in EVALUATIONS.values()],
+        "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
+        "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
         "list": [list.ListCfg],

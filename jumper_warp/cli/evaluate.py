@@ -5,10 +5,10 @@ The policy comes first: its task decides which flags there are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
@@ -17,7 +17,6 @@ from jumper_warp.utils.errors import suggestion
 from jumper_warp.utils.files import read_json
 
 if TYPE_CHECKING:
-    from jumper_warp.evaluation.evaluations import Evaluation
     from jumper_warp.evaluation.run import EvaluationRun
     from jumper_warp.tasks.cfg import TaskCfg
 
@@ -52,7 +51,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         return
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
-    evaluate(run, parse("evaluate", run.task, args, EvaluateCfg, lambda kind: kind.flags))
+    evaluate(run, parse("evaluate", run.task, args, EvaluateCfg))
 
 
 def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType]) -> None:
@@ -60,7 +59,7 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
-    suites, name = suites_for(task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
+    suites, name = suites_for(task), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
         if not suites:
             raise UsageError(f"there are no suites for policies of {task.name}")
@@ -106,14 +105,14 @@ def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = (
         return EvaluationRun(policy, modules)
 
 
-def parse(command: str, task: TaskCfg, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]) -> Any:
+def parse(command: Literal["evaluate", "play"], task: TaskCfg, args: Sequence[str], kind: Any) -> Any:
     """Parse the flags of a command that runs a policy, and return the settings; args: the policy, then flags.
 
-    kind: generic dataclass of the settings, such as `EvaluateCfg`. flags_of: returns the defaults of the task's flags.
-    Raises UsageError: a flag belongs to other tasks only, or a setting is out of range.
+    kind: generic dataclass of the settings, such as `EvaluateCfg`. Raises UsageError: a flag belongs to other tasks
+    only, or a setting is out of range.
     """
-    from jumper_warp.evaluation.evaluations import evaluation_of
+    from jumper_warp.evaluation.evaluations import default_flags
 
     policy, *args = args
-    flags = flags_of(evaluation_of(task))
+    flags = default_flags(task.evaluation, command)
     return parse_flags(kind[type(flags)], f"{command} {policy}", args, description=kind.__doc__, default=kind(flags))

@@ -43,4 +43,4 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.evaluation.commands import PlayCfg, play
 
     run = open_run(policy, modules, args)
-    play(run, parse("play", run.task, args, PlayCfg, lambda kind: kind.play))
+    play(run, parse("play", run.task, args, PlayCfg))

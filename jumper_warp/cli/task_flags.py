@@ -17,7 +17,8 @@ import tyro
 import warp as wp
 
 from jumper_warp.cli.flags import field_docs
-from jumper_warp.tasks.cfg import Reset, TaskCfg
+from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
+from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
 
@@ -53,6 +54,8 @@ def _flag(value: Any, hint: Any, where: str) -> Setting | None:
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
         return _flag(value.settings, Any, where)
+    if isinstance(value, Command | Evaluation):
+        return None
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _flag_of_dataclass(value, where)
     if parts := _parts(value):

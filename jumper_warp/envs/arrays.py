@@ -15,7 +15,6 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
-from jumper_warp.tasks.commands import check_commands
 from jumper_warp.tasks.overlay_ranges import with_own_ranges
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.streams import PURPOSES, Purpose
@@ -231,7 +230,7 @@ def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) 
     array, n, errors = as_float32(commands, "commands"), len(mask), []
     for task in tasks:
         try:
-            check_commands(array, task, n, mask > 0.0)
+            task.command.check(array, task.name, mask > 0.0)
         except InputError as error:
             errors.append(error)
     if len(errors) == len(tasks):

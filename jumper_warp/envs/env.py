@@ -255,7 +255,7 @@ class Env(Stages):
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
         """Begin episodes with given commands in the default pose and first task; `step` resets no world until `reset`.
 
-        commands: one row a world or one for all, columns as in `jumper_warp.tasks.commands.layout_of`; headings [rad]:
+        commands: one row a world or one for all, columns as in the `labels` of `Command`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
         Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
         """

@@ -57,6 +57,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
     than reporting; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.run import HEADLINES
     from jumper_warp.evaluation.trained import trained_success
     from jumper_warp.policies.folder import add_files
     from jumper_warp.policies.runs import is_run
@@ -72,7 +73,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     run.run_episodes(run.env(log.count), log)
     metrics = cfg.flags.metrics(log) | trained_success(run.task, log)
     entry = TASKS.get(run.task.name)
-    values = run.report(metrics, run.evaluation.paper if entry and entry.of_project else {})
+    paper = run.evaluation.paper if entry and entry.of_project else {}
+    values = run.report(metrics, paper, (*HEADLINES, *log.main_metrics))
     if cfg.save_to_policy:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
         add_files(find_policy(run.source), files)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,16 +12,15 @@ import numpy as np
 
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.checks import FLOAT32_MAX
-from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.metrics import Metrics, mean, rate
+from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 MAX_SECONDS = 600.0  # [s] Maximum length of an episode
 MAX_COMMAND_SIZE = 4  # Maximum number of values in a command
+STATISTICS = {"mean": mean, "max": largest, "rate": rate}  # By `EpisodeMetric.statistic`
 
 
 @dataclass
@@ -28,7 +28,7 @@ class EpisodeLog(EvaluationLog):
     """Log of one episode per world of any task; entries of a world do not change after its episode's end."""
 
     commands: np.ndarray
-    """(num_envs, n) Command of each world, `jumper_warp.tasks.commands.layout_of`; n = 0: the task samples commands."""
+    """(num_envs, n) Command of each world, as in the task's `Command`; n = 0: the task samples commands."""
     task: TaskCfg
     seconds: float = 10.0  # [s] Maximum simulated time
     end: np.ndarray = field(init=False)  # (num_envs,) Index of the termination that ended the episode, -1 while it runs
@@ -45,6 +45,10 @@ class EpisodeLog(EvaluationLog):
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
         self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
         self._start: dict[str, np.ndarray] = {}  # Sampled numbers of the task's state at the start, (num_envs,) each
+        own: Any = self.task.evaluation  # an `EpisodeEvaluation`
+        self.metrics, self.goal_marker = own.metrics, own.goal_marker
+        self.main_metrics = [metric.key for metric in own.metrics]
+        self.state: dict[str, np.ndarray] = {}  # Fields of the task's state, (num_envs, ...), that `own` names
         self.identical = count > 1  # Whether all worlds have been in equal states so far
 
     def begin(self, env: Env) -> None:
@@ -55,6 +59,8 @@ class EpisodeLog(EvaluationLog):
             env.episodes.level.fill_(len(self.task.levels))
             env.reset()
         arrays = env.task_arrays()
+        names = [metric.field for metric in self.metrics] + [self.goal_marker] * bool(self.goal_marker)
+        self.state = {name: arrays[name].copy() for name in names}
         self.start_position = arrays["base_pos"].copy()
         self.identical &= rows_are_equal(arrays)
         if self.count == 1 or not self.commands.shape[1]:
@@ -65,6 +71,8 @@ class EpisodeLog(EvaluationLog):
         self.identical = self.identical and rows_are_equal(arrays)
         running = self.end < 0
         self.end_position[running] = arrays["base_pos"][running]
+        for name, values in self.state.items():
+            values[running] = arrays[name][running]
         self._height_sum[running] += arrays["base_pos"][running, 2]
         self._steps[running] += 1
         self.length[running] += step_dt
@@ -94,13 +102,21 @@ class EpisodeLog(EvaluationLog):
     def columns(self) -> dict[str, list]:
         """Return one value per episode by name: command, length, mean base height, final base position, outcome.
 
-        Keys: command_<i>, length_s, mean_base_height_m, base_<axis>_m, end (outcome); without commands or of a single
-        robot also start_<field>, each number of the task's state that the reset sampled.
+        Keys: command_<label>, length_s, mean_base_height_m, base_<axis>_m, fields of the task's metrics, end (outcome);
+        without commands or of a single robot also start_<field>, each number of the state that the reset sampled.
         """
-        columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
+        columns = dict(zip(command_columns(self.task), self.commands.T, strict=False)) | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
         columns |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
+        columns |= {metric.field: self.state[metric.field] for metric in self.metrics}
         return listed(columns | {"end": self.outcomes})
+
+    def marks(self) -> dict[str, np.ndarray]:
+        """Return the goals or heights that the task's `goal_marker` names, those of the end after an episode."""
+        if not self.goal_marker:
+            return {}
+        goal = self.state[self.goal_marker]
+        return {"heights": goal} if goal.ndim == 1 else {"goals": goal[:, None]}
 
     def series(self) -> dict[str, np.ndarray]:
         """Return values to plot: base height and horizontal distance from the start [m] of all worlds."""
@@ -109,10 +125,12 @@ class EpisodeLog(EvaluationLog):
         return {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
-        """Return titles of some worlds, such as "episode 1, command 0.6 0"."""
-        commands = [" ".join(["", *(f"{value:g}" for value in self.commands[world])]) for world in worlds]
-        pairs = zip(super().labels(worlds), commands, strict=True)
-        return [f"{name}, command{command}" if command else name for name, command in pairs]
+        """Return titles of some worlds, such as "episode 1, x 0.6 m, y 0 m", or "episode 1, command 0.6 0"."""
+        titles = super().labels(worlds)
+        if not self.commands.shape[1]:
+            return titles
+        commands = [command_text(self.task, self.commands[world]) for world in worlds]
+        return [f"{title}, {command}" for title, command in zip(titles, commands, strict=True)]
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return metadata of a recording: the commands of some worlds, key `commands`, a list of rows."""
@@ -123,6 +141,20 @@ def rows_are_equal(arrays: dict[str, np.ndarray]) -> bool:
     """Return whether all rows of each array are equal within rounding, NaN included."""
     numbers = [np.asarray(values, dtype=float) for values in arrays.values()]
     return all(np.allclose(each, each[:1], rtol=1e-6, atol=1e-6, equal_nan=True) for each in numbers)
+
+
+def command_columns(task: TaskCfg) -> list[str]:
+    """Return the names of the values of a task's command as columns, such as `command_x_m`; `command_0` if unnamed."""
+    words = [re.sub(r"\W+", "_", label.removesuffix(" [1]")).strip("_") for label in task.command.labels]
+    return [f"command_{word}" for word in words or range(MAX_COMMAND_SIZE)]
+
+
+def command_text(task: TaskCfg, command: np.ndarray) -> str:
+    """Return a command (n,) in words, such as "x 0.6 m, y 0 m", or as "command 0.6 0" if its values have no names."""
+    values = [f"{value:g}" for value in command]
+    pairs = zip(task.command.labels, values, strict=False)
+    words = [label[:-1].replace("[", f"{value} ").removesuffix(" 1").replace("/", " per ") for label, value in pairs]
+    return ", ".join(words) or " ".join(["command", *values])
 
 
 def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -158,15 +190,14 @@ def episode_metrics(episodes: EpisodeLog, count: int | None = None) -> Metrics:
         "distance_from_start_mean_m": mean(np.linalg.norm(displacement, axis=1), over),
         "moved_x_signed_mean_m": mean(displacement[:, 0], over),
         "moved_y_signed_mean_m": mean(displacement[:, 1], over),
-    }
+    } | {m.key: STATISTICS[m.statistic](episodes.state[m.field][:count], over) for m in episodes.metrics}
 
 
 def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> None:
     """Raise InputError unless number of episodes, command and length [s] are within their limits."""
-    if count < 1:
-        raise InputError(f"num_episodes must be at least 1, got {count}")
-    if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
-        raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
+    check(count >= 1, f"num_episodes must be at least 1, got {count}")
+    fits = len(command) <= MAX_COMMAND_SIZE and all(abs(value) <= FLOAT32_MAX for value in command)
+    check(fits, f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
     check(0.0 < seconds <= MAX_SECONDS, f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
 
 
@@ -177,7 +208,7 @@ def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.nd
     """
     if not command:
         return np.zeros((count, 0))
-    missing = max(layout_of(task).counts[0] - len(command), 0)
+    missing = max(task.command.counts[0] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
 

@@ -1,27 +1,15 @@
-"""Table EVALUATIONS of evaluation settings (flags, terminations), with `TaskCfg.evaluation_suite` as key."""
+"""Flags of `jumper evaluate` and `play` for the policies of a task, from the task's `Evaluation`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+import importlib
+from dataclasses import fields
 from typing import Any, Literal, Protocol
 
-from jumper_warp.evaluation import velocities
-from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
-from jumper_warp.evaluation.jump_metrics import (
-    HEIGHT_PAPER,
-    PLACE_PAPER,
-    HeightFlags,
-    HeightPlayFlags,
-    LandingFlags,
-    LandingPlayFlags,
-)
-from jumper_warp.evaluation.jumps import with_jump_terminations
 from jumper_warp.evaluation.log import EvaluationLog
-from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import TASKS
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
 from jumper_warp.utils.metrics import Metrics
 
 
@@ -50,47 +38,18 @@ class PlayFlags(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Settings of `jumper evaluate`, `play` and `finetune` for the policies of a task."""
+def default_flags(evaluation: Evaluation, command: Literal["evaluate", "play"]) -> Any:
+    """Return the default flags of a command for a task, with the values of the evaluation's fields of the same names.
 
-    flags: EvaluationFlags  # Default flags of `jumper evaluate`
-    play: PlayFlags  # Default flags of `jumper play`
-    prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
-    """Function that returns a copy of the task with the terminations of the evaluation."""
-    finetune_target: Literal["apex", "landing"] | None = None
-    """Error that `jumper finetune` reduces; None: these policies cannot be fine-tuned."""
-    paper: Mapping[str, float] = field(default_factory=dict)  # Values in the paper of metrics with the same keys
+    They are `EvaluationFlags` for `jumper evaluate`, and `PlayFlags` for `jumper play`.
+    """
+    module, _, name = evaluation.flags.partition(":")
+    kind = getattr(importlib.import_module(module), f"{name}{'Play' * (command == 'play')}Flags")
+    values = vars(evaluation)
+    return kind(**{spec.name: values[spec.name] for spec in fields(kind) if spec.name in values})
 
 
-HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), with_jump_terminations, "apex", HEIGHT_PAPER)
-LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), with_jump_terminations, "landing", PLACE_PAPER)
-EVALUATIONS: dict[str, Evaluation] = {
-    "apex_height": HEIGHT_EVALUATION,
-    "landing_position": LANDING_EVALUATION,
-    "apex_height_mars": replace(
-        HEIGHT_EVALUATION, paper={}, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
-        play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0),
-    ),
-    "landing_position_mars": replace(
-        LANDING_EVALUATION, paper={}, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
-        play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
-    ),
-    "omnidirectional": replace(
-        LANDING_EVALUATION, paper={}, finetune_target=None,
-        flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
-        play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
-    ),
-    "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground, paper=velocities.PAPER),
-    "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
-    "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
-}  # fmt: skip
-"""Evaluations of tasks by name; a user's module may add entries."""
-
-
-def evaluation_of(task: TaskCfg) -> Evaluation:
-    """Return the evaluation settings of a task's policies. Raises PolicyError: EVALUATIONS lacks `evaluation_suite`."""
-    if task.evaluation_suite not in EVALUATIONS:
-        known = f"known are {[*EVALUATIONS]}"
-        raise PolicyError(f"{task.name}: unknown evaluation_suite {task.evaluation_suite!r:.60}; {known}")
-    return EVALUATIONS[task.evaluation_suite]
+def stock_evaluations() -> dict[str, Evaluation]:
+    """Return an evaluation of each kind that a stock task has, by `Evaluation.kind`, and that of any task."""
+    stock = [entry.task(name).evaluation for name, entry in TASKS.items() if entry.of_project]
+    return {each.kind: each for each in (*stock, EpisodeEvaluation())}

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
@@ -26,6 +25,7 @@ from jumper_warp.policies.policy import Policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
@@ -51,7 +51,7 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
-        return evaluation_of(task).prepare_task(task).on_level_ground()
+        return task.evaluation.prepare_task(task).on_level_ground()
 
     def with_latencies(task: TaskCfg) -> TaskCfg:
         ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)
@@ -75,10 +75,11 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
                 own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}
                 robot = with_fixed_ranges(robot, own, nominal=True)
             env = env_of_recipe(recipe, count, conditions, change=change_task, robot=robot)
-            target = evaluation_of(env.task).finetune_target
-            if target is None:
-                raise InputError(f"fine-tuning supports jumps to heights and positions, not {env.task.name}")
-            goals, to_height = np.zeros((count, 3)), target == "apex"
+            evaluation = env.task.evaluation
+            to_height = isinstance(evaluation, HeightEvaluation)
+            if not to_height and not (isinstance(evaluation, PlaceEvaluation) and evaluation.goal_x[0] > 0.0):
+                raise InputError(f"fine-tuning supports jumps to heights and to places ahead, not {env.task.name}")
+            goals = np.zeros((count, 3))
             low, high = cfg.height_range if to_height else cfg.distance_range
             goals[:, 2 if to_height else 0] = np.linspace(low, high, count)
             delays = rng.uniform(*DELAYS, count)

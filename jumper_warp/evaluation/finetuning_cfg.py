@@ -9,7 +9,6 @@ import tyro
 
 from jumper_warp.evaluation.log import check
 from jumper_warp.utils.checks import check_positive
-from jumper_warp.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,8 @@ class FinetuneCfg:
     had one)."""
 
     def __post_init__(self) -> None:
-        if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
-            raise InputError("fine-tuning needs at least 2 goals; numbers of jumps and steps must not be negative")
+        enough = self.num_goals >= 2 and min(self.num_delayed, self.num_randomized, self.iterations) >= 0
+        check(enough, "fine-tuning needs at least 2 goals; numbers of jumps and steps must not be negative")
         for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):
             check_positive(name, getattr(self, name))
         for name in ("height_range", "distance_range"):

@@ -12,18 +12,11 @@ import tyro
 from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome, random_headings
 from jumper_warp.evaluation.log import check, within
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.utils.checks import check_finite
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 Position2D = tuple[float, float]  # [m] Ahead and to the left
-HEIGHT_PAPER = {"apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0}
-"""Metrics of the paper's simulation of jumps to heights by key; the paper evaluates the apex only."""
-PLACE_PAPER = {
-    "success_rate": 0.97, "in_range_success_rate": 1.0, "goal_distance_at_rest_mean_m": 0.026,
-    "goal_distance_at_end_mean_m": 0.026,
-}  # fmt: skip
-"""Metrics of the paper's simulation of jumps to landing positions by key."""
 MAX_ROBOTS = 64  # Maximum number of robots in one recording
 JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
@@ -107,14 +100,13 @@ class JumpFlags:
     """Flags of `jumper evaluate` for jumps from rest in the default pose."""
 
     num_jumps: int = 200  # Number of jumps
-    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
+    success_range: tuple[float, float] = field(default=PlaceEvaluation.success_range, kw_only=True)
     """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
 
     def __post_init__(self) -> None:
-        if self.num_jumps < 1:
-            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
-        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
-            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
+        check(self.num_jumps >= 1, f"num_jumps must be at least 1, got {self.num_jumps}")
+        low, high = self.success_range
+        check(0.0 <= low <= high < 10.0, f"success_range must be in [0, 10) m and rise, got {self.success_range}")
 
     def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of a finished log of jumps: of all, and of those with goals within `success_range`."""
@@ -128,13 +120,13 @@ class JumpFlags:
 class HeightFlags(JumpFlags):
     """Flags of `jumper evaluate` for jumps to evenly spaced heights."""
 
-    success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
-    height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
+    success_range: tuple[float, float] = field(default=HeightEvaluation.success_range, kw_only=True)
+    height_range: tuple[float, float] = HeightEvaluation.height_range  # [m] Lowest and highest commanded base height
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 < self.height_range[0] <= self.height_range[1] < 10.0:
-            raise InputError(f"height_range must be in (0, 10) m and rise, got {self.height_range}")
+        low, high = self.height_range
+        check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m and rise, got {self.height_range}")
 
     def log(self, task: TaskCfg, seed: int) -> JumpLog:
         """Return a new log of one jump per world to evenly spaced heights; seed has no effect."""
@@ -145,12 +137,13 @@ class HeightFlags(JumpFlags):
 class HeightPlayFlags:
     """Flags of `jumper play` for jumps to heights."""
 
-    height: tuple[float, ...] = (0.6, 0.9, 1.1)  # [m] Commanded base heights, one robot each
-    length: tyro.conf.Suppress[float] = 3.5  # [s] Length of the recording, unless `jumper play --seconds` sets it
+    height: tuple[float, ...] = HeightEvaluation.height  # [m] Commanded base heights, one robot each
+    length: tyro.conf.Suppress[float] = HeightEvaluation.length
+    """[s] Length of the recording, unless `jumper play --seconds` sets it."""
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
-            raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
+        fits = 1 <= len(self.height) <= MAX_ROBOTS and all(0.0 < height < 10.0 for height in self.height)
+        check(fits, f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
     def log(self, task: TaskCfg) -> JumpLog:
         """Return a new log of one jump per robot to the flags' heights."""
@@ -161,9 +154,9 @@ class HeightPlayFlags:
 class LandingFlags(JumpFlags):
     """Flags of `jumper evaluate` for jumps to landing positions from rest in the default pose."""
 
-    goal_x: tuple[float, float] = (0.3, 1.5)
+    goal_x: tuple[float, float] = PlaceEvaluation.goal_x
     """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
-    goal_y: tuple[float, float] = (0.0, 0.0)
+    goal_y: tuple[float, float] = PlaceEvaluation.goal_y
     """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
     heading: Literal["any"] | float = "any"  # [deg] Heading of all robots, or any: sampled from the full circle
 
@@ -191,14 +184,14 @@ class LandingPlayFlags:
     """[m] Goal of a robot, ahead and to the left; repeat the flag for each robot (default: three goals)."""
     next_goals: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; repeat it for each jump."""
-    default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
+    default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = PlaceEvaluation.default_goals
     """[m] Goals if `goal` is not passed; a default of `goal` itself would be kept when the flag is passed."""
 
     def __post_init__(self) -> None:
         for name in ("goal", "next_goals"):
             places = getattr(self, name)
-            if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
-                raise InputError(f"{name} takes up to {MAX_ROBOTS} positions in (-10, 10) m, got {places}")
+            fits = len(places) <= MAX_ROBOTS and all(-10.0 < value < 10.0 for place in places for value in place)
+            check(fits, f"{name} takes up to {MAX_ROBOTS} positions in (-10, 10) m, got {places}")
 
     @property
     def goals(self) -> tuple[Position2D, ...]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, listed
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, check, listed
 from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.terms import TerminationTerm
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
@@ -28,17 +28,6 @@ REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
 NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because an earlier jump failed
-TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
-"""Terminations of an evaluated jump in order of precedence; success is last, so that falls take precedence."""
-
-
-def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of a task that keeps only the terminations for evaluated jumps, in the order of TERMINATIONS.
-
-    Terminations for training are left out.
-    """
-    terms = {term.name: term for term in task.terminations}
-    return replace(task, terminations=tuple(terms[name] for name in TERMINATIONS if name in terms))
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
@@ -201,8 +190,8 @@ class JumpLog(EvaluationLog):
         goals = np.asarray(goals, dtype=float)
         if goals.ndim == 1:
             goals = goals[:, None, None] * [0.0, 0.0, 1.0]
-        if goals.ndim != 3 or goals.shape[2] not in (2, 3):
-            raise InputError(f"goals must have shape (num_envs,) or (num_envs, jumps, 2 or 3), got {goals.shape}")
+        fits = goals.ndim == 3 and goals.shape[2] in (2, 3)
+        check(fits, f"goals must have shape (num_envs,) or (num_envs, jumps, 2 or 3), got {goals.shape}")
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
         self.headings, self.delay, self.rest = headings, delay, rest
         self.to_heights = bool((self.goals[..., 2] > 0.0).all())  # whether all goals are apex heights
@@ -234,9 +223,8 @@ class JumpLog(EvaluationLog):
         self._air_time, self._paw_air_time = np.zeros(self.count), np.zeros((self.count, 4))
         self._paw_start = np.full((self.count, 4, 2), np.nan)  # [m] last contacts before takeoff
         self._paw_touched, self._rising_flight = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
-        if SUCCESS not in terminations:
-            names = ", ".join(terminations)
-            raise InputError(f"the evaluation needs a termination {SUCCESS!r}, the task has {names}")
+        names = ", ".join(terminations)
+        check(SUCCESS in terminations, f"the evaluation needs a termination {SUCCESS!r}, the task has {names}")
         self._success = terminations.index(SUCCESS)
 
     @property

@@ -29,6 +29,7 @@ class EvaluationLog(ABC):
 
     row_name = "jump"  # Noun for a trial; names the recording
     main_columns: Sequence[str] = ()  # Names of the columns in the summary of `jumper play`; empty: all
+    main_metrics: Sequence[str] = ()  # Keys of the task's own metrics, for the summary of `jumper evaluate`
     spacing = 1.2  # [m] Distance between robots that a recording shows side by side
     count: int  # Number of worlds
     arrays: dict[str, np.ndarray]  # Result of the last `read_env`, one row per world

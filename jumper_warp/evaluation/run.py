@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.evaluations import evaluation_of
-from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
@@ -25,8 +24,9 @@ from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.evaluation import Evaluation
+from jumper_warp.tasks.jump.evaluation import PlaceEvaluation
 from jumper_warp.tasks.overlay_ranges import range_words
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import Report, output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
     from jumper_warp.envs.env import Env
 
-HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
-PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
-"""Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
 HEADLINES = (
     "success_rate", "within_training_success_rate", "beyond_training_success_rate", "goal_reached_rate",
     "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "slewed_rmse_vx_m_s", "slewed_rmse_vy_m_s",
@@ -66,8 +63,7 @@ class EvaluationArgs(Conditions, PrintFlags):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_recorded < 0:
-            raise InputError(f"num_recorded must not be negative, got {self.num_recorded}")
+        check(self.num_recorded >= 0, f"num_recorded must not be negative, got {self.num_recorded}")
         checked_threads(self.threads)
 
 
@@ -226,7 +222,7 @@ class EvaluationRun(Run):
         """Load a policy; call `prepare` before any other method.
 
         source: name or folder of a policy, a run's folder, or a checkpoint; modules: the user's task modules.
-        Raises PolicyError, also for an unknown evaluation, or CheckpointError.
+        Raises PolicyError or CheckpointError.
         """
         super().__init__()
         self.source = source
@@ -235,24 +231,23 @@ class EvaluationRun(Run):
         self.policy = open_policy(source)
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
-        self.evaluation = evaluation_of(self.task)
+        self.evaluation = self.task.evaluation
         self.settings = {"task": self.task.name, **trained_range(self.task)}
 
     @classmethod
     def from_args(
-        cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES, modules: Iterable[ModuleType] = ()
-    ) -> EvaluationRun:
+        cls, name: str, args: EvaluationArgs, kind: type[Evaluation] = PlaceEvaluation,
+        modules: Iterable[ModuleType] = (),
+    ) -> EvaluationRun:  # fmt: skip
         """Return a prepared evaluation of the policy `args.policy` with the flags of an experiment.
 
-        name: of the output folder; evaluations: accepted keys of `EVALUATIONS`, else PolicyError; modules: the user's
-        task modules. Also raises the errors of the constructor and `prepare`.
+        name: of the output folder; kind: class of the task's evaluation, else PolicyError; modules: the user's task
+        modules. Also raises the errors of the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
-        if run.task.evaluation_suite not in evaluations:
-            raise PolicyError(
-                f"expected a policy with evaluation suite {' or '.join(evaluations)}, "
-                f"{args.policy} (task {run.task.name}) has {run.task.evaluation_suite}"
-            )
+        if not isinstance(run.evaluation, kind):
+            found = f"{args.policy} (task {run.task.name}) has a {type(run.evaluation).__name__}"
+            raise PolicyError(f"expected a policy of a task with a {kind.__name__}, {found}")
         return run.prepare_from(name, args)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

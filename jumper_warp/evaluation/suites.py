@@ -21,6 +21,7 @@ from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
 from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
@@ -354,6 +355,6 @@ def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
 SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Consecutive, Platform, Farthest)
 
 
-def suites_for(evaluation: str) -> dict[str, type[Suite]]:
-    """Return the suites, by name, that accept policies whose `evaluation_suite` is `evaluation`."""
-    return {suite.name: suite for suite in SUITES if evaluation in suite.evaluations}
+def suites_for(task: TaskCfg) -> dict[str, type[Suite]]:
+    """Return the suites, by name, that accept policies of a task."""
+    return {suite.name: suite for suite in SUITES if isinstance(task.evaluation, suite.kind)}

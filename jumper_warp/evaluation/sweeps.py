@@ -10,21 +10,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.jump_metrics import HEIGHT_PAPER, PLACE_METRICS, PLACE_PAPER, HeightFlags, LandingFlags
-from jumper_warp.evaluation.jumps import (
-    DELAY,
-    REST_TIME,
-    TOLERANCE,
-    JumpLog,
-    random_headings,
-    with_jump_terminations,
-    with_second_takeoff,
-)
+from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, HeightFlags, LandingFlags
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, JumpLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import check, within
-from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation.run import HEADLINES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation, with_jump_terminations
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
 
@@ -44,8 +37,8 @@ class Suite(EvaluationArgs, ABC):
     rest_time: float = REST_TIME  # [s] Time from touchdown to the end of a jump
 
     name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
-    evaluations: ClassVar[tuple[str, ...]] = PLACES  # Keys of `EVALUATIONS` of the policies that the suite accepts
-    paper: ClassVar[dict[str, float]] = {}  # Values in the paper of metrics with the same names
+    kind: ClassVar[type[JumpEvaluation]] = PlaceEvaluation  # Evaluation of the tasks whose policies the suite accepts
+    paper: ClassVar[Mapping[str, float]] = {}  # Values in the paper of metrics with the same names
     summary: ClassVar[tuple[str, ...]] = HEADLINES  # Keys of the metrics in the summary
     least: ClassVar[int] = 1  # Minimum number of jumps
 
@@ -69,7 +62,7 @@ class Suite(EvaluationArgs, ABC):
 
     def evaluate(self, modules: Iterable[ModuleType] = ()) -> tuple[EvaluationRun, Metrics]:
         """Run the suite on its policy; return the evaluation and the metrics, without writing or printing them."""
-        run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
+        run = EvaluationRun.from_args(self.name, self, self.kind, modules)
         run.settings["rest_s"] = self.rest_time
         return run, self.measure(run)
 
@@ -135,8 +128,8 @@ class HeightSweep(Sweep):
     num_recorded: int = 5
 
     name: ClassVar = "range"
-    evaluations: ClassVar = HEIGHTS
-    paper: ClassVar = HEIGHT_PAPER
+    kind: ClassVar = HeightEvaluation
+    paper: ClassVar = HeightEvaluation.published
     summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
                          "open_loop_apex_mean_m")  # fmt: skip
     pushed: ClassVar = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
@@ -188,7 +181,7 @@ class DistanceSweep(Sweep):
     num_recorded: int = 5
 
     name: ClassVar = "range"
-    paper: ClassVar = PLACE_PAPER
+    paper: ClassVar = PlaceEvaluation.published
     summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
     pushed: ClassVar = ("success_rate", "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate",
                         "landing_tilt_max_deg", "goal_distance_at_rest_mean_m")  # fmt: skip

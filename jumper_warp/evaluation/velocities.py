@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from jumper_warp.evaluation.jumps import wrapped
 from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
 AXES = ("vx", "vy", "yaw_rate")
 UNITS = ("m_s", "m_s", "rad_s")  # Units of AXES, as keys of metrics end
-PAPER = {"slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12}
-"""Tracking errors of the paper: one test on the robot, with commands up to 0.8 m/s or rad/s given by a person."""
 SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from the settled tracking errors
 SLEW_RATE = 1.25  # [m/s^2], [rad/s^2] Rate at which the authors' commands change
 STANDING = 64  # Number of robots that are commanded to stand
@@ -257,11 +254,10 @@ class VelocityFlags:
     command_interval: float = 3.0  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
-        if not 0.1 <= self.command_interval <= 600.0:
-            raise InputError(f"command_interval must be in [0.1, 600] s, got {self.command_interval}")
+        interval = self.command_interval
+        check(0.1 <= interval <= 600.0, f"command_interval must be in [0.1, 600] s, got {interval}")
         check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
-        if self.commands_per_axis < 2:
-            raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
+        check(self.commands_per_axis >= 2, f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
         """Return a new log of walks, one robot per world; seed: for the order of the commands after the first."""

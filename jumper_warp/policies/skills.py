@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 from jumper_warp.policies.conditions import Conditions, shared_robot
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.switching import skills_and_handovers
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,11 +49,9 @@ class SkillPolicies:
         self.policies = [open_policy(source) for source in self.sources]
         self.recipes = [policy.recipe() for policy in self.policies]
         self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
-        suites = (("velocity",), ("apex_height",), ("landing_position", "omnidirectional"))
-        for task, accepted in zip(self.tasks, suites, strict=True):
-            if task.evaluation_suite not in accepted:
-                needed = " or ".join(accepted)
-                raise PolicyError(f"expected a policy with evaluation suite {needed}, got one of task {task.name}")
+        for task, kind in zip(self.tasks, (VelocityEvaluation, HeightEvaluation, PlaceEvaluation), strict=True):
+            if not isinstance(task.evaluation, kind):
+                raise PolicyError(f"expected a policy of a task with a {kind.__name__}, got one of {task.name}")
         self.skills, self.handovers = self._skills_and_handovers(Conditions())
 
     def _skills_and_handovers(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:

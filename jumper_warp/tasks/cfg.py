@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
@@ -17,6 +19,7 @@ from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.copying import Copyable, Struct
+from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
 from jumper_warp.tasks.functions import check_result, check_values, place_of, shown_type
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -41,6 +44,7 @@ TASK_BOUNDS = {
     "reward_floor": (-MOST_SETTING, MOST_SETTING, ""),
 }  # fmt: skip
 """Smallest and largest value of settings of a task, and unit."""
+LABEL = re.compile(r"[^/\[\]]+ \[[^\[\]]+\]")  # Name of a command's value, with its unit
 
 
 @dataclass(frozen=True)
@@ -71,11 +75,50 @@ class Command(Copyable):
     """Condition to sample a new command in this step: @wp.func (state) -> bool; None: never."""
     resample: Function | None = None
     """Function that samples a command: @wp.func (robot, scene: Scene, state, level, rng: RngStream) -> state."""
+    labels: tuple[str, ...] = ()
+    """Names of the one to four values, with units, as `x [m]`; empty: one to four values without names."""
+    optional: int = 0
+    """Number of values at the end of `labels` that may be omitted, which means 0."""
+    least: tuple[float | None, ...] = ()
+    """Smallest allowed values, in the order of `labels`; None or omitted: unbounded."""
+    nonzero: bool = False
+    """Whether at least one value must differ from 0."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if only one of resample_due and resample is given."""
+        """Raise InputError for one of resample_due and resample alone, or a wrong number of labels or bounds."""
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
+        labelled = all(LABEL.fullmatch(label) for label in self.labels)
+        if not labelled or not max(len(self.least), self.optional + 1) <= (len(self.labels) or 1) <= 4:
+            wanted = "1 to 4 labels with units, as 'x [m]', the first not optional"
+            raise InputError(f"a command has {wanted}, got {self.labels!r:.200}")
+
+    @property
+    def counts(self) -> range:
+        """Allowed numbers of values: with all, some or none of the optional ones."""
+        return range(len(self.labels) - self.optional, len(self.labels) + 1) if self.labels else range(1, 5)
+
+    def check(self, commands: np.ndarray, task: str, worlds: np.ndarray) -> None:
+        """Raise InputError unless commands have the number of values, and the values the bounds, of this command.
+
+        commands: (num_envs, n), or (n,) for all worlds; task: its name; worlds: (num_envs,) bool, to check bounds in.
+        """
+        subject, num_envs = f"commands of {task} are {self}", len(worlds)
+        if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in self.counts]:
+            raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
+        if not np.isfinite(commands).all():
+            raise InputError("commands must be finite")
+        rows = np.broadcast_to(commands, (num_envs, commands.shape[-1]))[worlds]
+        for label, least, column in zip(self.labels, self.least, rows.T, strict=False):
+            if least is not None and (column < least).any():
+                raise InputError(f"{subject}: {label} must be at least {least:g}, got {column.min():g}")
+        if self.nonzero and (rows == 0.0).all(axis=1).any():
+            raise InputError(f"{subject}: not all may be 0")
+
+    def __str__(self) -> str:
+        """Return the names of the command's values with units, for messages."""
+        first = len(self.labels) - self.optional
+        return ", ".join(label + " (optional)" * (i >= first) for i, label in enumerate(self.labels)) or "1 to 4 values"
 
 
 @dataclass(frozen=True)
@@ -126,8 +169,8 @@ class TaskCfg(Copyable):
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
     """Logged metrics of the task's state, in addition to the means of all terms."""
-    evaluation_suite: str = "episode"
-    """Name of the suite that evaluates and plays policies, a key of `evaluation.evaluations.EVALUATIONS`."""
+    evaluation: Evaluation = field(default_factory=EpisodeEvaluation)
+    """Evaluation of the task's policies, by `jumper evaluate` and `play`."""
 
     groups = ("actor", "critic")
     """Names of the observation groups."""
@@ -154,6 +197,7 @@ class TaskCfg(Copyable):
         for metric in self.metrics:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs a field {field_name!r} of the state")
+        self.evaluation.check(self.name, self.state)
         check_gravity(self.gravity)
         check_bounds(f"{self.name}:", self, TASK_BOUNDS)
 

@@ -27,7 +27,7 @@ from jumper_warp.utils.checks import FLOAT32_MAX, NAME, in_float32, version_erro
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import with_neighbours
 
-VERSION = 4  # of the saved format
+VERSION, LAST_OF_VERSION_4 = 5, "7f5b55c3"  # Version of the saved format; last commit that reads version 4
 OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
 MAX_ENTRIES = 1000  # of a list: a kernel of more terms would compile for a day
 
@@ -136,7 +136,7 @@ def check_version(saved: Any) -> None:
     if not isinstance(saved, dict):
         raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
     if (version := saved.get("version")) != VERSION:
-        raise TaskError(f"the task {version_error(shown(version), VERSION)}")
+        raise TaskError(f"the task {version_error(shown(version), VERSION, LAST_OF_VERSION_4)}")
 
 
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
@@ -227,10 +227,9 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
     for key, default in kind.options.items():
         if key not in saved:
             continue
-        if isinstance(default, bool | int | str):
-            saved[key] = _scalar(saved[key], type(default), f"{where}.{key}")
-        else:
-            saved[key] = _value(saved[key], wp.Function, f"{where}.{key}", find)
+        hint = type(default) if isinstance(default, bool | int | str) else wp.Function
+        hint = tuple[int, ...] | None if default is None else hint
+        saved[key] = _value(saved[key], hint, f"{where}.{key}", find)
     if not 0 <= saved.get("history", 1) <= MAX_ENTRIES:
         raise TaskError(f"{where}.history must be at most {MAX_ENTRIES}")
     for key in set(saved) - set(kind.options) - {"name"}:

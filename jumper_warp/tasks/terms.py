@@ -13,27 +13,26 @@ from typing import Any, ClassVar, get_type_hints
 
 import warp as wp
 
+from jumper_warp.kernels.mdp import mirror
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.random import RngStream
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.tasks.copying import Copyable
 from jumper_warp.tasks.functions import check_function, place_of, shown_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
 REQUIRED = inspect.Parameter.empty
-AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
-LEGS = ("FL", "FR", "BL", "BR")
 OBSERVATION_BOUNDS = {
     "noise": (0.0, 1.0e3), "noise_limit": (1.0e-3, 10.0), "scale": (1.0e-6, 1.0e6), "clip": (1.0e-6, 1.0e6)
 }  # fmt: skip
 """Smallest and largest settings of an observation term; noise and clip in the unit of the function."""
 LARGEST = 1.0e9  # Largest absolute value of a term's number
 MAX_HISTORY = 1000  # Largest number of frames of an observation term
-MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer", "inner"))
 
 
 class Term(Copyable):
@@ -195,11 +194,12 @@ class ObservationTerm(Term):
     RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays, ground: Ground, world: int, ...).
     noise: standard deviation of Gaussian noise, in the function's unit, cut at noise_limit standard deviations; then
     values are clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest first. delayed:
-    whether the world's observation latency applies.
+    whether the world's observation latency applies. mirror: mirror image of the value, as in
+    `jumper_warp.kernels.mdp.mirror`, such as (1, -2, 3) for a vector (default: the stock function's).
     """
 
     settings: ClassVar = {"noise": 0.0, "noise_limit": 1.0, "scale": 1.0, "clip": 100.0}
-    options: Mapping[str, Any] = {"history": 1, "delayed": False}
+    options: Mapping[str, Any] = {"history": 1, "delayed": False, "mirror": None}
     takes: ClassVar = ((RobotView, Any), (RobotParameters, wp.int32), (RobotArrays, Ground, wp.int32))
 
     def __init__(self, func: Function, **values: Any) -> None:
@@ -214,6 +214,10 @@ class ObservationTerm(Term):
             if not low <= self.numbers[key] <= high:
                 limits = f"{low:g} to {high:g}, got {self.numbers[key]:.6g}"
                 raise InputError(f"ObservationTerm {self.name}: {key} must be in {limits}")
+        image = dict(enumerate(self.mirror or range(1, self.width + 1), 1))
+        if len(image) != self.width or {abs(k): i if k > 0 else -i for i, k in image.items()} != image:
+            wanted = f"1 to {self.width}, each once with a sign, and be its own inverse"
+            raise InputError(f"ObservationTerm {self.name}: mirror must have {wanted}, got {self.mirror}")
 
     def _may_return(self, kind: Any, state: Any = Any) -> bool:
         """Return whether the term's function may return values of type `kind`: a number or a vector."""
@@ -232,14 +236,20 @@ class ObservationTerm(Term):
         return 1 if returned in (float, wp.float32) else returned._length_
 
     @property
+    def mirror(self) -> tuple[int, ...] | None:
+        """Mirror image of a frame's columns, as in `jumper_warp.kernels.mdp.mirror`; None: not known."""
+        return self.options["mirror"] or getattr(self.func, "mirror", None)
+
+    @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns of all frames, oldest first: `gravity_x_3_ago`, ..., `gravity_x`."""
-        width = self.width
-        if width == 1:
-            frame = (self.name,)
-        else:
-            suffixes = AXES.get(width) or {4: LEGS, 12: MOTORS}.get(width) or tuple(map(str, range(width)))
-            frame = tuple(f"{self.name}_{suffix}" for suffix in suffixes)
+        """Names of the columns of all frames, oldest first: `gravity_x_3_ago`, ..., `gravity_x`.
+
+        Columns that are mirrored as legs or motors have their names; others of 2 to 4 are x, y, z, w, as in Warp.
+        """
+        names = {mirror.LEGS: LEGS, mirror.MOTORS: MOTOR_JOINTS}.get(self.mirror or (), "xyzw"[: self.width])
+        if len(names) < self.width:
+            names = map(str, range(self.width))
+        frame = (self.name,) if self.width == 1 else tuple(f"{self.name}_{name}" for name in names)
         ages = range(self.options["history"] - 1, -1, -1)
         return tuple(f"{column}_{age}_ago" if age else column for age in ages for column in frame)
 

@@ -26,7 +26,7 @@ MOST_WORLDS = 2**20  # Largest number of simulated worlds
 MOST_SETTING = 1.0e6  # Largest absolute value of a setting of a task, in its unit
 FLOAT32_MIN = 1.1754944e-38  # Smallest positive normal float32; a GPU may round smaller values to 0
 MOST_SEED = 2**31 - 1  # Largest valid seed; the kernels' random streams take an int32
-LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies, tasks and runs of the previous version
+LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies and runs of the previous version
 
 
 def in_float32(value: float) -> str:
@@ -169,7 +169,7 @@ def check_filter_speed(horizon: float, speed_floor: float) -> None:
             raise InputError(f"filter {name} must be in {low:g} to {high:g}, got {value}")
 
 
-def version_error(version: str, known: int) -> str:
-    """Return the error message for a file of unsupported `version`, with the commit that reads version `known - 1`."""
-    previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
+def version_error(version: str, known: int, last: str = LAST_OF_PREVIOUS_VERSION) -> str:
+    """Return the error message for a file of unsupported `version`; last: commit that reads version `known - 1`."""
+    previous = f"commit {last} reads version {known - 1}"
     return f"has version {version}, expected version {known}; {previous}"

@@ -16,7 +16,7 @@ from jumper_warp.utils.tables import WIDTH, print_table
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
     "_per_s": "1/s", "_n_m": "N/m", "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg",
-    "_mm": "mm", "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+    "_rad": "rad", "_mm": "mm", "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
 }  # fmt: skip
 """Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
 

@@ -106,7 +106,8 @@ def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = N
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
     The moments of a robot that moves by less than STAYS, or DRIFT a hop, across the picture are drawn spread to the
-    right. eye: as in `write_picture`. Frames after `valid_frames` are ignored. Raises InputError: no frame remains.
+    right, unless it has a goal farther than GAP from its start. eye: as in `write_picture`. Frames after `valid_frames`
+    are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -114,12 +115,14 @@ def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = N
     fields = ("times", "poses", "contact_points", "contact_forces", "commands")
     recording = replace(recording, **{name: getattr(recording, name)[:count] for name in fields})
     base = recording.body_poses(rank)[:, 0, :3].astype(float)
-    displacement = base[-1, :2] - base[0, :2]
+    goals = recording.goals[rank, :, :2] if len(recording.goals) else np.zeros((0, 2))
+    offsets = np.concatenate([base[-1:, :2], goals]) - base[0, :2]
+    displacement = offsets[0]
     distance = float(np.linalg.norm(displacement))
     flights = _flights(recording, rank)
     across = None if eye is None else np.array([-eye[1], eye[0], 0.0]) / np.hypot(eye[0], eye[1])
-    width = distance if across is None else abs(float(displacement @ across[:2]))
-    stays = width < max(STAYS, DRIFT * len(flights))
+    widths = np.linalg.norm(offsets, axis=1) if across is None else np.abs(offsets @ across[:2])
+    stays = bool(widths[0] < max(STAYS, DRIFT * len(flights)) and not (widths[1:] > GAP).any())
     right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
     if stays and across is not None:
         right = across

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..mdp.mirror import set_mirror
 from ..mdp.view import RobotView
 from .state import POLICY_RATE, AttitudeState, rotation_between
 
@@ -23,3 +24,7 @@ def time_left(robot: RobotView, state: AttitudeState) -> float:
 def in_collision(robot: RobotView, state: AttitudeState) -> float:
     """Collision flag: 1 if links touch each other or anything but a paw touches the ground, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)
+
+
+set_mirror((-1, 2, -3, 4), turn_left)
+set_mirror((1,), time_left, in_collision)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..mdp.mirror import set_mirror
 from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, floor_surface, world_ground
 from .phase import estimated_apex, estimated_landing
@@ -128,3 +129,10 @@ def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
     if block.exists != 0:
         distances[6] = float(block.height) - float(floor_surface(ground, block.center[0], block.center[1])[0])
     return distances
+
+
+set_mirror((1,), wanted_height, jump_command)
+set_mirror((1, 2), phase_times, height_errors)
+set_mirror((1, -2), goal, landing_miss, way)
+set_mirror((1, 2, 3), phase)
+set_mirror((5, 6, 3, 4, 1, 2, 7), block_ahead)  # begin and end of left, middle and right ray; height

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..layout import BODIES
+from ..mdp.mirror import LEGS, set_mirror
 from ..mdp.view import RobotArrays, RobotView, base_pos, base_quat, rotate_yaw, yaw_of
 from ..terrain.ground import Ground, surface, world_ground
 from .state import POLICY_RATE, VelocityState
@@ -72,3 +73,11 @@ def ground_heights(arrays: RobotArrays, ground: Ground, world: int) -> vec15:
         offset = rotate_yaw(wp.vec3(0.25 * float(i / 3 - 2), 0.2 * float(i % 3 - 1), 0.0), heading)
         heights[i] = pos[2] - surface(here, pos[0] + offset[0], pos[1] + offset[1])[0] - 0.35
     return heights
+
+
+set_mirror((1, -2, -3), command)
+set_mirror((-1, -2), gait_phase)
+set_mirror((1,), command_age)
+set_mirror(LEGS, contact_times, recent_steps, paw_heights)
+set_mirror((1, -2, 3, -4, 5, -6), push)
+set_mirror((3, 2, 1, 6, 5, 4, 9, 8, 7, 12, 11, 10, 15, 14, 13), ground_heights)  # 5 rows of 3 across

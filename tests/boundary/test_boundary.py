@@ -28,7 +28,6 @@ HARMLESS = {
     ("task", "levels"): "levels may repeat",
     ("task", "randomization"): "null means that a parameter is not randomised",
     ("task", "metrics"): "metrics may be null or repeat",
-    ("task", "evaluation_suite"): "an unknown suite is refused when a policy is evaluated",
     ("task", "reset.settings.ground"): "the vertical jump stands on flat ground",
     ("task", "curriculum.unit"): "a label of the log",
     **{

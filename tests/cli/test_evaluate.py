@@ -1,22 +1,21 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
-from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
-from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
+from jumper_warp.evaluation.evaluations import default_flags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import write_trials
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.tasks.jump.evaluation import TERMINATIONS, with_jump_terminations
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 from metric_helpers import values
 
-TASK = EVALUATIONS["landing_position"].prepare_task(make_task("horizontal-jump"))
+TASK = with_jump_terminations(make_task("horizontal-jump"))
 
 
 @pytest.fixture(scope="module")
@@ -29,19 +28,21 @@ def policies(tmp_path_factory):
 
 
 def test_jump_evaluations_check_success_after_failures():
-    kinds = {name: evaluation_of(make_task(name)) for name in TASKS if name.endswith("-jump")}
-    assert [kinds[name] is EVALUATIONS[key] for name, key in (
-        ("vertical-jump", "apex_height"), ("horizontal-jump", "landing_position"),
-        ("omnidirectional-jump", "omnidirectional"),
-    )] == [True] * 3  # fmt: skip
-    for name, kind in kinds.items():
-        ends = [term.name for term in kind.prepare_task(make_task(name)).terminations]
+    for name in (name for name in TASKS if "-jump" in name):
+        task = make_task(name)
+        ends = [term.name for term in task.evaluation.prepare_task(task).terminations]
         assert ends == list(TERMINATIONS), name
 
 
-def test_refuses_unknown_evaluation():
-    with pytest.raises(PolicyError, match=r"unknown evaluation_suite 'walk'; known are \['apex_height', "):
-        evaluation_of(replace(TASK, evaluation_suite="walk"))
+def test_flags_have_the_values_of_the_tasks_evaluation():
+    evaluation = make_task("vertical-jump-mars").evaluation
+    assert default_flags(evaluation, "evaluate") == HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9))
+    assert default_flags(evaluation, "play") == HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+
+
+def test_paper_is_compared_for_the_ranges_of_its_own_test():
+    names = ("vertical-jump", "vertical-jump-mars", "horizontal-jump", "omnidirectional-jump", "velocity-rough")
+    assert [bool(make_task(name).evaluation.paper) for name in names] == [True, False, True, False, True]
 
 
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():

@@ -4,16 +4,26 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePlayFlags, episode_metrics
+from jumper_warp.evaluation.episodes import (
+    EpisodeFlags,
+    EpisodeLog,
+    EpisodePlayFlags,
+    command_columns,
+    command_text,
+    episode_metrics,
+)
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.cfg import Command
+from jumper_warp.tasks.evaluation import EpisodeEvaluation, EpisodeMetric
 from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_report, read_values
 from landing_helpers import still_policy
 from metric_helpers import values
 
 DT = 0.5  # [s] Policy step of the stub
-TASK = make_task("vertical-jump")
+TASK = replace(make_task("vertical-jump"), evaluation=EpisodeEvaluation())
 ENDS = [term.name for term in TASK.terminations]  # Names by index of the termination
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -72,11 +82,11 @@ def test_episode_metrics_match_hand_computed_values(episodes):
 
 def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     columns = episodes.columns()
-    assert columns["command_0"] == [0.5] * 4 and columns["command_2"] == [0.0] * 4
+    assert columns["command_x_m"] == [0.5] * 4 and columns["command_height_m"] == [0.0] * 4
     assert columns["length_s"] == [0.5, 1.0, 1.0, 0.5]
     assert columns["base_x_m"] == [1.5, 1.0, 1.0, None]
     assert columns["end"] == ["success", "low_base", "no_end", "diverged"]
-    name = "episode 2, command 0.5 0.1 0"
+    name = "episode 2, x 0.5 m, y 0.1 m, height 0 m"
     series = {f"height/base, {name} [m]": 0.0, f"distance/from start, {name} [m]": pytest.approx(0.4)}
     assert episodes.named(episodes.series(), [1]) == series
 
@@ -104,7 +114,7 @@ def test_refuses_invalid_settings(make, message):
 def policy(tmp_path_factory):
     """Folder of a policy that holds the default pose, of a task with the general evaluation `episode`."""
     folder, still = tmp_path_factory.mktemp("policy") / "still", still_policy("horizontal-jump")
-    task = replace(make_task("horizontal-jump"), name="any-task", evaluation_suite="episode")
+    task = replace(make_task("horizontal-jump"), name="any-task", evaluation=EpisodeEvaluation())
     still.config = {"env": {"task": task_to_json(task)}}
     still.interface = replace(still.interface, task="any-task")
     save_policy(folder, still)
@@ -124,7 +134,7 @@ def test_policy_of_any_task_is_evaluated_with_metrics_and_trials(policy, tmp_pat
     assert (saved["task"], saved["ended_by_no_jump_rate"]) == ("any-task", 1.0)
     assert saved["base_height_mean_m"] == pytest.approx(0.35, abs=0.02)
     assert saved["length_mean_s"] < 4.0 and saved["failure_termination_rate"] == 1.0
-    assert trials["end"].tolist() == ["no_jump"] * 3 and trials["command_0"].tolist() == [0.5] * 3
+    assert trials["end"].tolist() == ["no_jump"] * 3 and trials["command_x_m"].tolist() == [0.5] * 3
 
 
 def goals_of(policy, folder, *flags):
@@ -169,3 +179,35 @@ def test_policy_of_any_task_is_recorded(policy, tmp_path, capsys):
 def test_command_beyond_those_of_resets_is_named_in_one_line(policy, tmp_path, capsys):
     play.run([policy, *"--seconds 0.1 --device cpu --command 9 0.1 --out".split(), str(tmp_path)], [])
     assert "jumper: beyond the training of any-task: goal[0] 9 (resets sampled -" in capsys.readouterr().err
+
+
+def test_commands_are_named_by_their_labels_without_slashes():
+    """A slash would end a name in the viewer's tree."""
+    walk, turn = make_task("velocity-flat"), make_task("attitude")
+    assert command_text(walk, np.array([0.5, 0.0, -1.0])) == "forward 0.5 m per s, left 0 m per s, turning -1 rad per s"
+    assert command_text(turn, np.array([1.0, 0.0, 0.0, 0.0])).startswith("quaternion x 1, quaternion y 0, ")
+    assert command_text(replace(walk, command=Command(walk.command.set)), np.array([0.5, 1.0])) == "command 0.5 1"
+    assert command_columns(walk)[::2] == ["command_forward_m_s", "command_turning_rad_s"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"labels": ("x",)}, {"labels": ("a/b [m]",)}, {"labels": ("x [m]",) * 5}, {"labels": ("x [m]",), "optional": 1},
+     {"labels": ("x [m]",), "least": (0.0, 0.0)}, {"optional": 1}],
+)  # fmt: skip
+def test_refuses_labels_of_a_command_that_do_not_fit(wrong):
+    with pytest.raises(InputError, match="a command has 1 to 4 labels with units"):
+        Command(make_task("velocity-flat").command.set, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "message"),
+    [
+        ({"goal_marker": "way"}, "the state needs a field 'way', float32 or vec3f"),
+        ({"goal_marker": "steps"}, "the state needs a field 'steps'"),
+        ({"metrics": (EpisodeMetric("error_mean_m", "goal"),)}, "the state needs a field 'goal', float32 or int32"),
+    ],
+)
+def test_refuses_an_evaluation_of_a_field_that_the_state_lacks(evaluation, message):
+    with pytest.raises(InputError, match=message):
+        replace(TASK, evaluation=EpisodeEvaluation(**evaluation))

@@ -6,9 +6,10 @@ import pytest
 import warp as wp
 
 from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations, with_second_takeoff, wrapped
+from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff, wrapped
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.rotations import yaw_of
 from metric_helpers import values
 

@@ -10,10 +10,11 @@ import pytest
 from columns import Z
 from experiments import departures
 from jumper_warp.cli.train import parse_train
-from jumper_warp.evaluation.jumps import TERMINATIONS, jump_commands
+from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.runs import load_policy
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values

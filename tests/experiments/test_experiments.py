@@ -10,12 +10,13 @@ import torch
 from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, new_reward, soak_test
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jump_metrics import HeightFlags
-from jumper_warp.evaluation.jumps import JumpLog, with_jump_terminations
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, still_policy

@@ -10,7 +10,7 @@ import torch
 
 from columns import X, Y
 from experiments import paper_tests
-from jumper_warp.evaluation.jumps import TERMINATIONS, JumpLog
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
@@ -26,6 +26,7 @@ from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import format_value
 from jumper_warp.utils.output import read_values

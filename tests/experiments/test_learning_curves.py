@@ -65,14 +65,14 @@ def test_training_of_a_number_of_iterations_is_evaluated_at_equal_steps(env, mon
 
 
 @pytest.mark.parametrize(
-    ("suite", "limits", "goals"),
+    ("kind", "limits", "goals"),
     [
-        ("apex_height", None, [[0.0, 0.0, 0.5], [0.0, 0.0, 0.8], [0.0, 0.0, 1.1]]),
-        ("landing_position", None, [[0.3, 0.0, 0.0], [0.9, 0.0, 0.0], [1.5, 0.0, 0.0]]),
-        ("landing_position", (1.0, 2.0), [[1.0, 0.0, 0.0], [1.5, 0.0, 0.0], [2.0, 0.0, 0.0]]),
+        ("height", None, [[0.0, 0.0, 0.5], [0.0, 0.0, 0.8], [0.0, 0.0, 1.1]]),
+        ("place", None, [[0.3, 0.0, 0.0], [0.9, 0.0, 0.0], [1.5, 0.0, 0.0]]),
+        ("place", (1.0, 2.0), [[1.0, 0.0, 0.0], [1.5, 0.0, 0.0], [2.0, 0.0, 0.0]]),
     ],
 )
-def test_evaluated_jumps_are_to_heights_or_to_places_ahead(suite, limits, goals, monkeypatch):
+def test_evaluated_jumps_are_to_heights_or_to_places_ahead(kind, limits, goals, monkeypatch):
     logs = []
 
     def jump(act, env, jumps):
@@ -80,7 +80,7 @@ def test_evaluated_jumps_are_to_heights_or_to_places_ahead(suite, limits, goals,
         jumps.end[:] = jumps.terminations.index("success")
 
     monkeypatch.setattr(learning, "run_evaluation", jump)
-    task = SimpleNamespace(evaluation_suite=suite, termination_names=("success",))
+    task = SimpleNamespace(evaluation=SimpleNamespace(kind=kind), termination_names=("success",))
     trainer = SimpleNamespace(model=SimpleNamespace(act=None))
     assert learning.success_rate(trainer, SimpleNamespace(task=task, num_envs=3), limits) == 0.0  # never at rest
     np.testing.assert_allclose(logs[0][:, 0], goals)

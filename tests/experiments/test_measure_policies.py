@@ -10,7 +10,7 @@ import scipy.stats
 
 from experiments import measure_policies
 from jumper_warp.cli.main import main as jumper
-from jumper_warp.evaluation.evaluations import EVALUATIONS
+from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.runs import load_policy
@@ -54,11 +54,12 @@ def test_condition_is_undefined_only_where_its_change_does_nothing():
     }
 
 
-@pytest.mark.parametrize(("suite", "count"), [("apex_height", 300), ("omnidirectional", 300), ("attitude", 300),
-                                              ("velocity", 2 * 5**3 + 64)])  # fmt: skip
-def test_evaluations_have_at_least_the_requested_trials(suite, count):
-    flags = with_trials(EVALUATIONS[suite].flags, 300)
-    assert flags.log(EvaluationRun("walking_flat").task if suite == "velocity" else jump_task(), 0).count == count
+@pytest.mark.parametrize(("policy", "count"), [("vertical_jump", 300), ("omnidirectional_jump", 300),
+                                               ("attitude", 300), ("walking_flat", 2 * 5**3 + 64)])  # fmt: skip
+def test_evaluations_have_at_least_the_requested_trials(policy, count):
+    run = EvaluationRun(policy)
+    flags = with_trials(default_flags(run.evaluation, "evaluate"), 300)
+    assert flags.log(run.evaluation.prepare_task(run.task), 0).count == count
 
 
 def jump_task():

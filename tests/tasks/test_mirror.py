@@ -1,23 +1,28 @@
 """Observations of mirrored robots: the second half of an environment's worlds is the mirror image of the first half."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from columns import ANG_VEL, LIN_VEL, POS, QUAT
 from jumper_warp.kernels.mdp import observations as obs
+from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.tasks.cfg import ObservationsCfg
-from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.utils.errors import InputError
 from velocity_helpers import edit, states_of, walking_env
 
 HALF = 8  # worlds
+LEGS = [1, 0, 3, 2]  # FL, FR, BL, BR with sides swapped
+MOTORS = [3 * leg + j for leg in LEGS for j in range(3)]
 BODIES = 21
 SWAPPED_COORDS = [7 + 5 * leg + j for leg in LEGS for j in range(5)]  # of the 20 hinges
 SWAPPED_DOFS = [column - 1 for column in SWAPPED_COORDS]
@@ -121,6 +126,27 @@ def test_mirroring_twice_is_the_identity():
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)
+
+
+@wp.func
+def sideways(robot: RobotView, state: Any) -> wp.vec4:
+    """Return zeros."""
+    return wp.vec4(0.0)
+
+
+def test_refuses_a_mirror_image_that_is_not_its_own_inverse():
+    ObservationTerm(sideways, mirror=(2, 1, -3, 4))
+    for wrong in ((1, 2, 3), (2, 3, 1, 4), (-2, 1, 3, 4), (0, 1, 2, 3), (1, 2, 3, 5)):
+        with pytest.raises(InputError, match="ObservationTerm sideways: mirror must have 1 to 4, each once"):
+            ObservationTerm(sideways, mirror=wrong)
+
+
+def test_only_columns_that_are_mirrored_as_legs_have_names_of_legs():
+    def ends(**mirror):
+        return [name.removeprefix("sideways_") for name in ObservationTerm(sideways, **mirror).columns]
+
+    assert ends() == ends(mirror=(1, -2, 3, -4)) == ["x", "y", "z", "w"]
+    assert ends(mirror=(2, 1, 4, 3)) == ["FL", "FR", "BL", "BR"]
 
 
 def test_refuses_a_term_without_a_known_mirror_image():

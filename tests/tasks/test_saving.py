@@ -133,8 +133,10 @@ def test_setting_that_json_cannot_restore_is_not_saved(value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(version=3), "the task has version 3, expected version 4; commit 05fa856 reads version 3"),
-        (lambda t: t.pop("version"), "the task has version None, expected version 4; commit 05fa856"),
+        (lambda t: t.update(version=4), "the task has version 4, expected version 5; commit 7f5b55c3 reads version 4"),
+        (lambda t: t.pop("version"), "the task has version None, expected version 5; commit 7f5b55c3"),
+        (lambda t: t.update(evaluation={"type": "jumper_warp.robot.motors:LimitsCfg"}), "expected .* an? Evaluation"),
+        (lambda t: t["observations"]["actor"][0].update(mirror=[2]), "wanted_height: mirror must have 1 to 1"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
         (lambda t: t["rewards"][3].pop("weight"), r"task.rewards\[3\]: a reward needs a weight"),

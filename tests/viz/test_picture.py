@@ -74,6 +74,21 @@ def test_short_jump_is_spread_in_its_direction_and_a_drift_is_not(distance, head
     assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
 
 
+@pytest.mark.parametrize(
+    ("distance", "goal", "eye", "spread"),
+    [
+        (0.5, 0.5, None, False), (0.5, np.nan, None, True), (0.0, 0.5, None, False), (0.0, 0.1, None, True),
+        (0.5, 0.5, (0.0, -1.0, 0.1), False), (0.5, 0.5, (1.0, 0.0, 0.1), True),
+    ],
+)  # fmt: skip
+def test_jump_to_a_goal_away_from_its_start_is_to_scale_with_the_goal(distance, goal, eye, spread):
+    """From the front (eye ahead), start and goal are at one place of the picture, and moments are spread."""
+    recording = jump_recording(distance, goals=np.array([[[goal, 0.0, 0.0]]]))
+    scene = compose(recording, eye=eye)
+    assert scene.stays == spread and (scene.shift.any() == spread)
+    assert any(shape.name == "goal_0_0" for shape in picture._shapes(scene)) == (not spread)
+
+
 def test_each_of_two_jumps_in_a_row_has_its_apex():
     positions, forces = jump(1.0)
     later = positions + [1.0, 0.0, 0.0]

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
 from jumper_warp.kernels.attitude.commands import TurnRanges
 from jumper_warp.kernels.attitude.start_states import AttitudeSettings
+from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_probabilities
 from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class AttitudeEvaluation(Evaluation):
+    """Evaluation of commanded turns in free flight."""
+
+    flags: ClassVar = "jumper_warp.evaluation.attitude:Attitude"
 
 
 @dataclass(frozen=True)

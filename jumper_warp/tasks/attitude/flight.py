@@ -17,7 +17,7 @@ from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, walking_filter
-from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
+from jumper_warp.tasks.attitude.cfg import AttitudeEvaluation, AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import DRAWN, ROBOT, exact
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -77,7 +77,7 @@ def attitude_in_flight() -> TaskCfg:
         state=AttitudeState,
         advance=Advance(state.advance_attitude, tolerance=TOLERANCE * DEG),
         reset=Reset(reset_attitude, AttitudeResetCfg(), parallel=True),
-        command=Command(set_turn),
+        command=Command(set_turn, labels=tuple(f"quaternion {axis} [1]" for axis in "xyzw"), nonzero=True),
         curriculum=Curriculum(
             state.attitude_error, tolerance=10.0 * DEG, promote_after=5, counts=state.every_episode, unit="rad"
         ),
@@ -94,5 +94,5 @@ def attitude_in_flight() -> TaskCfg:
         eval_height_offset=2.0,
         reward_floor=None,
         metrics=METRICS,
-        evaluation_suite="attitude",
+        evaluation=AttitudeEvaluation(),
     )

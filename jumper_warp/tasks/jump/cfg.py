@@ -11,12 +11,19 @@ from typing import Any, Literal
 import warp as wp
 
 from jumper_warp.kernels.jump.ground_draws import MIN_EDGE_DISTANCE, GroundRanges
-from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
+from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings, next_jump_due, resample_jump, set_jump
 from jumper_warp.kernels.jump.start_states import ResetRanges
 from jumper_warp.kernels.jump.state import vec_start_modes
+from jumper_warp.tasks.cfg import Command
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_probabilities
 from jumper_warp.utils.errors import InputError
+
+JUMP_COMMAND = Command(
+    set_jump, next_jump_due, resample_jump, optional=1,
+    labels=("x [m]", "y [m]", "height [m]", "policy step of the command [1]"), least=(None, None, 0.0, 0.0),
+)  # fmt: skip
+"""Command of a jump: landing position relative to robot and heading, and height of the base at the apex, 0 for any."""
 
 
 @dataclass(frozen=True)

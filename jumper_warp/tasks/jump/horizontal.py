@@ -13,8 +13,9 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import horizontal_jump_filter, jumping_motors
-from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
-from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.jump.cfg import JUMP_COMMAND, GroundCfg, Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.jump.evaluation import PlaceEvaluation
 from jumper_warp.tasks.jump.observations import HORIZONTAL, SIGHT, SIGHTED, critic
 from jumper_warp.tasks.jump.vertical import QUIET, STARTS
 from jumper_warp.tasks.observations import remembered
@@ -115,7 +116,7 @@ def horizontal_jump() -> TaskCfg:
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.25),
         reset=Reset(reset.reset_jump, RESET, parallel=True),
-        command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
+        command=JUMP_COMMAND,
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
@@ -135,7 +136,7 @@ def horizontal_jump() -> TaskCfg:
         command_filter=horizontal_jump_filter(),
         action_scale=(15.0, 90.0),
         self_collision_margin=0.005,
-        evaluation_suite="landing_position",
+        evaluation=PlaceEvaluation(),
     )
 
 
@@ -166,7 +167,12 @@ def omnidirectional_jump() -> TaskCfg:
     task = replace(
         task,
         name="omnidirectional-jump",
-        evaluation_suite="omnidirectional",
+        evaluation=PlaceEvaluation(
+            goal_x=(-0.7, 0.7),
+            goal_y=(-0.7, 0.7),
+            success_range=(0.0, 0.7),
+            default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0)),
+        ),
         levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
         reset=replace(task.reset, settings=settings),
     )

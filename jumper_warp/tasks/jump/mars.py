@@ -16,6 +16,7 @@ from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import GroundCfg, cross_levels
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.terms import RewardTerm
@@ -40,7 +41,7 @@ def vertical_jump_mars() -> TaskCfg:
         gravity=MARS,
         motors=mars_motors(10.0),
         levels=heights((0.7, 1.3), (0.7, 1.8), (0.7, 2.4), (0.7, 3.1)),
-        evaluation_suite="apex_height_mars",
+        evaluation=HeightEvaluation((1.0, 3.3), success_range=(1.0, 2.9), height=(1.5, 2.3, 3.0), length=6.0),
     )
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.05 * FARTHER))
     task = task.with_terms(
@@ -88,7 +89,9 @@ def horizontal_jump_mars() -> TaskCfg:
              level((3.0, 4.75), 0.3)), STARTS,
         ),
         reset=replace(task.reset, settings=settings),
-        evaluation_suite="landing_position_mars",
+        evaluation=PlaceEvaluation(
+            (0.5, 4.2), success_range=(0.5, 3.9), default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))
+        ),
     )  # fmt: skip
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.10 * FARTHER))
     task = task.with_terms(

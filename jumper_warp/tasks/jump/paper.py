@@ -15,8 +15,9 @@ from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import FilterCfg, LimitsCfg, jumping_motors
-from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
-from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.jump.cfg import JUMP_COMMAND, Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.observations import PAPER_ROBOT
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
@@ -215,7 +216,7 @@ def vertical_jump_paper() -> TaskCfg:
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.75),  # A
         reset=Reset(reset.reset_jump, VERTICAL_STARTS, parallel=True),
-        command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
+        command=JUMP_COMMAND,
         curriculum=Curriculum(errors.height_error, tolerance=0.05, promote_after=5, counts=reset.from_standing),  # A
         rewards=VERTICAL_REWARDS,
         terminations=VERTICAL_TERMINATIONS,
@@ -226,7 +227,7 @@ def vertical_jump_paper() -> TaskCfg:
         action_scale=(15.0, 90.0),  # §III
         randomization=RANDOMIZATION,
         reward_floor=0.0,  # A
-        evaluation_suite="apex_height",
+        evaluation=HeightEvaluation(),
     )
 
 
@@ -237,7 +238,7 @@ def horizontal_jump_paper() -> TaskCfg:
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.25),  # A
         reset=Reset(reset.reset_jump, HORIZONTAL_STARTS, parallel=True),
-        command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
+        command=JUMP_COMMAND,
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, promote_after=5, counts=reset.from_standing),  # A
         rewards=HORIZONTAL_REWARDS,
         terminations=HORIZONTAL_TERMINATIONS,
@@ -248,5 +249,5 @@ def horizontal_jump_paper() -> TaskCfg:
         action_scale=(15.0, 90.0),  # §III
         randomization=RANDOMIZATION,
         reward_floor=None,  # A
-        evaluation_suite="landing_position",
+        evaluation=PlaceEvaluation(),
     )

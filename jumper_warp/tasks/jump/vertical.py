@@ -11,8 +11,9 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
-from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
-from jumper_warp.tasks.jump.cfg import Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.jump.cfg import JUMP_COMMAND, Level, ResetCfg, StartProbability, cross_levels
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation
 from jumper_warp.tasks.jump.observations import VERTICAL, critic
 from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
@@ -90,7 +91,7 @@ def vertical_jump() -> TaskCfg:
         state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=TAKEOFF_SPEED),
         reset=Reset(reset.reset_jump, RESET, parallel=True),
-        command=Command(reset.set_jump, reset.next_jump_due, reset.resample_jump),
+        command=JUMP_COMMAND,
         curriculum=Curriculum(errors.height_error, tolerance=0.05, counts=reset.from_standing),
         rewards=REWARDS,
         terminations=TERMINATIONS,
@@ -100,5 +101,5 @@ def vertical_jump() -> TaskCfg:
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
         self_collision_margin=0.005,
-        evaluation_suite="apex_height",
+        evaluation=HeightEvaluation(),
     )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
-from jumper_warp.kernels.velocity.commands import CommandRanges
+from jumper_warp.kernels.velocity.commands import CommandRanges, resample_due, resample_velocity, set_velocity
 from jumper_warp.kernels.velocity.start_states import TileMap, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
+from jumper_warp.tasks.cfg import Command, TaskCfg
+from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_bounds, check_probabilities
 from jumper_warp.utils.errors import InputError
@@ -19,6 +21,27 @@ if TYPE_CHECKING:
     import newton
 
 Reach = tuple[float, float, float, float]  # largest speeds: ahead, back, sideways [m/s], turning [rad/s]
+
+VELOCITY_COMMAND = Command(
+    set_velocity, resample_due, resample_velocity, optional=1,
+    labels=("forward [m/s]", "left [m/s]", "turning [rad/s]", "gait [Hz]"), least=(None, None, None, 0.0),
+)  # fmt: skip
+"""Command of a velocity in body axes."""
+
+
+@dataclass(frozen=True)
+class VelocityEvaluation(Evaluation):
+    """Evaluation of velocity tracking on level ground, with commands from a grid of velocities."""
+
+    flags: ClassVar = "jumper_warp.evaluation.velocities:Velocity"
+    published: ClassVar = {
+        "slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12
+    }  # fmt: skip
+    """Tracking errors of the paper: one test on the robot, with commands up to 0.8 m/s or rad/s given by a person."""
+
+    def prepare_task(self, task: TaskCfg) -> TaskCfg:
+        """Return the task on a plane."""
+        return task.on_level_ground()
 
 
 @dataclass(frozen=True)

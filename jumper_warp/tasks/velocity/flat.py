@@ -17,17 +17,17 @@ from dataclasses import replace
 from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
-from jumper_warp.kernels.velocity import commands, rewards, state, terminations
 from jumper_warp.kernels.velocity import observations as velocity
+from jumper_warp.kernels.velocity import rewards, state, terminations
 from jumper_warp.kernels.velocity.reset import reset_velocity
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import walking_filter, walking_motors
-from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import DRAWN, ROBOT, exact, remembered
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND
-from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
+from jumper_warp.tasks.velocity.cfg import VELOCITY_COMMAND, CommandCfg, VelocityEvaluation, VelocityResetCfg
 
 SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")  # Names of the terms with observation latency
 
@@ -103,7 +103,7 @@ def velocity_flat() -> TaskCfg:
         state=VelocityState,
         advance=Advance(state.advance_velocity, settle=1.0 * SECOND),
         reset=Reset(reset_velocity, VelocityResetCfg(), parallel=True),
-        command=Command(commands.set_velocity, commands.resample_due, commands.resample_velocity),
+        command=VELOCITY_COMMAND,
         curriculum=Curriculum(
             state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"
         ),
@@ -116,7 +116,7 @@ def velocity_flat() -> TaskCfg:
         action_scale=(60.0, 60.0),
         randomization=RandomizationCfg.walking(),
         metrics=METRICS,
-        evaluation_suite="velocity",
+        evaluation=VelocityEvaluation(),
     )
 
 

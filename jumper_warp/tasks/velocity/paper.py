@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
-from jumper_warp.kernels.velocity import commands, rewards, state, terminations
 from jumper_warp.kernels.velocity import observations as velocity
+from jumper_warp.kernels.velocity import rewards, state, terminations
 from jumper_warp.kernels.velocity.reset import reset_velocity
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import FilterCfg, LimitsCfg, walking_motors
-from jumper_warp.tasks.cfg import Command, ObservationsCfg, Reset, TaskCfg
+from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import PAPER_ROBOT
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND
-from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
+from jumper_warp.tasks.velocity.cfg import VELOCITY_COMMAND, CommandCfg, VelocityEvaluation, VelocityResetCfg
 from jumper_warp.tasks.velocity.flat import METRICS, SENSED
 
 SENSES = tuple(term.replace(delayed=term.name in SENSED) for term in PAPER_ROBOT)  # latency of sensors (§V-F)
@@ -110,7 +110,7 @@ def velocity_paper() -> TaskCfg:
         state=VelocityState,
         advance=Advance(state.advance_velocity, settle=1.0 * SECOND),  # for metrics
         reset=Reset(reset_velocity, STARTS, parallel=True),
-        command=Command(commands.set_velocity, commands.resample_due, commands.resample_velocity),
+        command=VELOCITY_COMMAND,
         curriculum=Curriculum(
             state.tracking_error, tolerance=0.18, promote_after=1_000_000, counts=state.every_episode, unit="m_s"
         ),  # for metrics: the paper has none
@@ -126,5 +126,5 @@ def velocity_paper() -> TaskCfg:
         randomization=RANDOMIZATION,
         reward_floor=0.0,  # A
         metrics=METRICS,
-        evaluation_suite="velocity",
+        evaluation=VelocityEvaluation(),
     )

@@ -9,7 +9,7 @@ from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, POS, QUAT, X, Z
 from jump_helpers import DEG, Robots, edit_episodes, make_env, make_episode, only, without_draws
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.mirror import LEGS, mirror_of
+from jumper_warp.tasks.mirror import mirror_of
 from mdp_helpers import array
 
 HORIZONTAL, VERTICAL = (without_draws(make_task(name)) for name in ("horizontal-jump", "vertical-jump"))
@@ -267,8 +267,9 @@ def test_observations_of_a_mirrored_robot_are_the_mirror_image(task):
     robots = random_robots(task)
     first = robots.both()
     flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of angular velocities
-    joints = [5 * leg + j for leg in LEGS for j in range(5)]
-    motors = [3 * leg + j for leg in LEGS for j in range(3)]
+    legs = [1, 0, 3, 2]  # FL, FR, BL, BR with sides swapped
+    joints = [5 * leg + j for leg in legs for j in range(5)]
+    motors = [3 * leg + j for leg in legs for j in range(3)]
     robots.q[:, POS] *= flip
     robots.q[:, QUAT] *= [-1.0, 1.0, -1.0, 1.0]
     robots.q[:, 7:27] = robots.q[:, 7:27][:, joints]
@@ -276,7 +277,7 @@ def test_observations_of_a_mirrored_robot_are_the_mirror_image(task):
     robots.qd[:, 6:26] = robots.qd[:, 6:26][:, joints]
     robots.com = robots.com * flip
     robots.action, robots.offset = robots.action[motors], robots.offset[motors]
-    robots.force = robots.force[list(LEGS)] * flip
+    robots.force = robots.force[legs] * flip
     for episode in robots.tasks:
         episode.goal = wp.vec3(episode.goal[0], -episode.goal[1], episode.goal[2])
     second, observed_task = robots.both(), robots.skill.task

@@ -1,0 +1,73 @@
+"""Evaluation of a task's policies as data: flags of `jumper evaluate` and `play`, and metrics of the task's state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import warp as wp
+
+from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Base class of the evaluations of a task's policies; a field is the default of the flag with the same name."""
+
+    flags: ClassVar[str]
+    """Dataclasses of the flags, as `module:Name`: `NameFlags` has those of `jumper evaluate`, `NamePlayFlags` those of
+    `jumper play`; see `EvaluationFlags` and `PlayFlags` in `jumper_warp.evaluation.evaluations`."""
+    published: ClassVar[Mapping[str, float]] = {}
+    """Values in the paper of the metrics with the same keys, for the default settings."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the kind of evaluation, such as height: the class's, in lower case."""
+        return type(self).__name__.removesuffix("Evaluation").lower()
+
+    @property
+    def paper(self) -> Mapping[str, float]:
+        """Values in the paper of the metrics with the same keys; empty for other settings than the default ones."""
+        return self.published if self == type(self)() else {}
+
+    def prepare_task(self, task: Any) -> Any:
+        """Return a copy of a `TaskCfg` with the terminations and the ground of the evaluation."""
+        return task
+
+    def check(self, where: str, state: Any) -> None:
+        """Raise InputError, with `where` before it, unless the evaluation fits the task's `state`, a `@wp.struct`."""
+
+
+@dataclass(frozen=True)
+class EpisodeMetric:
+    """Metric of the evaluated episodes: a statistic of a field of the task's state at the end of each episode."""
+
+    key: str  # Name of the metric; ends in the unit, as `place_error_mean_m`
+    field: str  # Field of the state, a float or an int
+    statistic: Literal["mean", "max", "rate"] = "mean"
+    """Statistic over episodes; rate: fraction of the episodes whose field is not 0."""
+
+
+@dataclass(frozen=True)
+class EpisodeEvaluation(Evaluation):
+    """Evaluation of any task by single episodes: their length, termination and base position, and own metrics."""
+
+    metrics: tuple[EpisodeMetric, ...] = ()
+    """Metrics of the task's state."""
+    goal_marker: str = ""
+    """Field of the state that recordings and pictures mark: a place [m], world frame (vec3), or a height of the base
+    above z = 0 [m] (float); empty: none."""
+
+    flags: ClassVar = "jumper_warp.evaluation.episodes:Episode"
+
+    def check(self, where: str, state: Any) -> None:
+        """Raise InputError unless the state has the fields of all metrics and of the goal marker."""
+        wanted: dict[str, tuple[Any, ...]] = {
+            metric.field: (float, int, wp.float32, wp.int32) for metric in self.metrics
+        }
+        wanted |= {self.goal_marker: (float, wp.float32, wp.vec3)} if self.goal_marker else {}
+        for field, kinds in wanted.items():
+            if field not in state.vars or state.vars[field].type not in kinds:
+                types = " or ".join(kind.__name__ for kind in kinds[-2:])
+                raise InputError(f"{where} evaluation: the state needs a field {field!r:.60}, {types}")

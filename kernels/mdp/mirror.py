@@ -1,0 +1,19 @@
+"""Left-right mirror images of observations: a robot mirrored about its x-z plane observes them.
+
+A mirror image is a signed permutation. Entry i is the column, counted from 1, from which column i of the mirror image
+comes; it is negative if the sign changes. Lateral angles are positive outward, and transversal angles away from the
+leg's other link, so motors swap sides and keep their signs.
+"""
+
+from typing import Any
+
+VECTOR = (1, -2, 3)  # x, y, z of a vector, body axes
+ROTATION = (-1, 2, -3)  # x, y, z of a rotation vector or an angular velocity, body axes
+LEGS = (2, 1, 4, 3)  # FL, FR, BL, BR
+MOTORS = (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9)  # lateral, outer, inner motor of each leg
+
+
+def set_mirror(columns: tuple[int, ...], *functions: Any) -> None:
+    """Set the mirror image of the values of observation terms, the attribute `mirror` of their functions."""
+    for function in functions:
+        function.mirror = columns
