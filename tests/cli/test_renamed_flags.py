@@ -11,8 +11,6 @@ from jumper_warp.cli.sysid import ExciteCfg, SysidCfg
 from jumper_warp.cli.train import TrainArgs
 from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
-from support.soak import SoakArgs
 
 
 @pytest.mark.parametrize(
@@ -25,7 +23,6 @@ from support.soak import SoakArgs
         (SysidCfg, ["x.npz", "--mass_deviation", "0.1"], ["x.npz", "--mass-std", "0.1"]),
         (ExciteCfg, ["--torque", "--noise.torque", "1"], ["--record-torque", "--noise.torque", "1"]),
         (ExciteCfg, ["--exact"], ["--no-noise"]),
-        (SoakArgs, ["--no-filter"], ["--no-command-filter"]),
     ],
 )
 def test_old_flag_becomes_the_new_flag_and_prints_it(cfg, old, new, capsys):
@@ -89,15 +86,6 @@ def test_command_accepts_old_flag_and_refuses_both(capsys):
     assert (code, err) == (2, [renamed, "jumper: max_checkpoints must be a whole number of 1 to 1000000000, got 0"])
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "2", "--max-checkpoints", "2")
     assert (code, err) == (2, [f"{renamed}: give only --max-checkpoints"])
-
-
-def test_script_accepts_old_flags(capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["soak_test.py", "--envs", "8", "--no-filter"])
-    args = parse_flags(SoakArgs)
-    assert (args.num_envs, args.command_filter) == (8, False)
-    assert capsys.readouterr().err.splitlines() == [
-        "jumper: --envs is now --num-envs", "jumper: --filter is now --command-filter",
-    ]  # fmt: skip
 
 
 def test_negated_flag_of_a_group_keeps_its_negation():

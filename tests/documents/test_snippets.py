@@ -54,7 +54,7 @@ def bash(*lines, note=""):
         ["jumper sysid excite --out motions", "jumper sysid motions --mass 14.5 --out found",
          "jumper train vertical-jump --robot found/identified.json"],
         ["torchrun --nproc-per-node 2 -m jumper_warp train vertical-jump", "jumper --version"],
-        ["python experiments/vertical_jump_sweep.py --num-jumps 10", "make test", "python -m pytest tests/test_mdp.py",
+        ["python experiments/template.py --num-jumps 10", "make test", "python -m pytest tests/test_mdp.py",
          'pip install -e ".[gymnasium]"'],
     ],
 )  # fmt: skip
@@ -80,7 +80,7 @@ def test_correct_commands_pass_and_do_not_run(run, tmp_path, lines):
         ("jumper evaluate horizontal_jump --suite gird", "no suite 'gird'"),
         ("jumper trian vertical-jump", "jumper has no command 'trian'"),
         ("python experiments/vertical_sweep.py", "experiments/vertical_sweep.py: no such file"),
-        ("python experiments/vertical_jump_sweep.py --jumps 10 --num-jumps 10", "--num-jumps"),
+        ("python experiments/template.py --jumps 10 --num-jumps 10", "--num-jumps"),
         ("python experiments/squat_hold.py --policy vertikal_jump", "no policy 'vertikal_jump'"),
         ("rerun outputs/jump.rrd", "outputs/jump.rrd: no such file"),
         ("make dmeo", "the Makefile has no target dmeo"),

@@ -6,12 +6,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from columns import Z
+from experiments.flight_attitude import JUMP, OUTCOMES, TURN, FlightLog, flight_metrics
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
 from jumper_warp.utils.errors import InputError
 from metric_helpers import values
-from support.flights import JUMP, OUTCOMES, TURN, FlightLog, flight_metrics
 
 N = 4
 LATE = np.array([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.01], [0.0, 0.0]])

@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from experiments.walking_terrain import walked_fraction
+from experiments.walking_tracking import (
+    GaitRecorder,
+    gait_metrics,
+    kept_speeds,
+    settling_times,
+    step_commands,
+    top_speed,
+)
 from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, VelocityPlayFlags
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import measure
 from metric_helpers import values
-from support import gaits
-from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_fraction
 
 DT = 1.0 / 60.0  # [s] Policy step
 TASK = make_task("velocity-flat")
@@ -207,7 +214,7 @@ def test_gait_metrics_of_synthetic_trot():
     torque = np.zeros((steps, n, 12))
     torque[:, 0, 0], torque[7, 1, 3] = 2.0, -9.0
     power, speed, weight = np.full((steps, n), 30.0), np.full((steps, n), 0.5), np.full(n, 14.0 * 9.81)
-    metrics = values(gaits.gait_metrics(contact, height, force, torque, power, speed, weight, DT))
+    metrics = values(gait_metrics(contact, height, force, torque, power, speed, weight, DT))
     assert metrics["cost_of_transport"] == pytest.approx(30.0 / (14.0 * 9.81 * 0.5))
     assert metrics["share_down_FL_BR"] == metrics["share_down_FR_BL"] == pytest.approx(0.5)
     assert metrics["torque_max_nm"] == 9.0 and metrics["paw_force_ripple"] == pytest.approx(0.0, abs=1e-9)
@@ -219,7 +226,7 @@ def test_gait_metrics_of_synthetic_trot():
 
 def test_gait_recorder_skips_first_seconds_and_has_no_metrics_without_robots():
     env = SimpleNamespace(step_dt=DT)
-    gait = gaits.GaitRecorder(env, skip=0.5)
+    gait = GaitRecorder(env, skip=0.5)
     for _ in range(30):
         gait()
     assert not gait.contact and gait.metrics(np.zeros(2, dtype=bool)) == {}

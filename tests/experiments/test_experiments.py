@@ -1,4 +1,3 @@
-import dataclasses
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,13 +7,27 @@ import pytest
 import torch
 
 from experiments import (
+    attitude,
     benchmark_solver,
     benchmark_training,
+    departures,
+    flight_attitude,
     gradient_cost,
+    identification_starts,
     learning_curves,
+    leg_springs,
+    measure_policies,
     new_reward,
+    open_loop_jump,
+    paper_trainings,
     shac,
     soak_test,
+    squat_hold,
+    template,
+    trajectory_optimization,
+    walk_jump_walk,
+    walking_terrain,
+    walking_tracking,
 )
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jump_metrics import HeightFlags
@@ -23,13 +36,12 @@ from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
-from jumper_warp.registry import make_task
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values
 from support.learning import LearningCurve, run_jumps
-from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
 
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
@@ -54,6 +66,15 @@ def test_new_reward_is_logged_by_name(trained):
     assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
     assert values["episode_reward_even_load"] > 0.0
     assert read_values(folder)["iterations"] == 2
+
+
+def test_template_measures_the_landing_error_over_friction(tmp_path):
+    args = template.Args(frictions=(0.3, 0.8), num_jumps=2, out=tmp_path, device="cpu")
+    values = template.main(args)
+    slippery, nominal = (values[f"friction_{x}_goal_distance_at_end_mean_m"] for x in (0.3, 0.8))
+    assert nominal < 0.05 < slippery
+    for name in ("metrics.json", "friction.png", "friction_0.3.rrd", "friction_0.8.png"):
+        assert (tmp_path / name).stat().st_size > 1000, name
 
 
 # ---------------------------------------------------------------- the sweep
@@ -174,7 +195,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_p
 # ---------------------------------------------------------------- learning curves
 
 
-def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variants(tmp_path, monkeypatch):
+def test_learning_curves_report_time_to_success_rates(tmp_path, monkeypatch):
     def train(args, name, seed):
         if seed == 1:
             return LearningCurve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
@@ -194,8 +215,6 @@ def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variant
     assert values["seconds_to_100_percent_eager_1"] is None
     assert values["history"] == 1 and values["goals_m"] == [0.5, 0.9]
     assert (tmp_path / "learning_curves.png").is_file()
-    with pytest.raises(InputError, match=r"variants are default, .*, got 'faster'"):
-        replace(args, variants=("faster",))
 
 
 # ---------------------------------------------------------------- benchmark
@@ -218,43 +237,22 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
 
 
-def test_soak_of_simulation_and_environment_reports_no_invalid_worlds(tmp_path):
-    for task in (None, "horizontal-jump"):
-        args = SoakArgs(num_envs=8, steps=40, episode_steps=20, task=task, out=tmp_path, device="cpu")
-        values = soak_test.main(args)
-        saved = read_values(tmp_path)
-        assert saved == values | {"envs": 8, "filter": False, "seed": 0}
-        assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
-        assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
-
-
-def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):  # 4 worlds diverge in each of 5 steps
+def test_soak_counts_diverged_worlds_and_refuses_values_that_are_not_finite(tmp_path, monkeypatch):
+    args = soak_test.Args(num_envs=4, steps=5, hold_steps=5, tasks=("vertical-jump",), out=tmp_path, device="cpu")
+    values = soak_test.main(args)
+    assert values == read_values(tmp_path) and (values["steps"], values["non_finite_worlds"]) == (20, 0)
+    assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
     step = Env.step
     monkeypatch.setattr(Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    args = SoakArgs(
-        num_envs=4, steps=5, hold_steps=5, episode_steps=100, task="vertical-jump", out=tmp_path, device="cpu"
-    )
-    assert soak_test.main(args)["non_finite_worlds"] == 20
-
-
-def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
-    step = Env.step
+    assert soak_test.main(args)["non_finite_worlds"] == 20  # all worlds in each step
 
     def step_with_nan(env, action):
         step(env, action)
         env.reward[2] = torch.nan
 
     monkeypatch.setattr(Env, "step", step_with_nan)
-    args = SoakArgs(num_envs=4, steps=40, episode_steps=20, task="vertical-jump", out=tmp_path, device="cpu")
-    with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
+    with pytest.raises(RuntimeError, match="5 rows hold values that are not finite, by step 5"):
         soak_test.main(args)
-
-
-def test_hardest_keeps_only_last_terrain_row_and_tasks_without_terrain():
-    terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
-    assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
-    for name in ("velocity-flat", "vertical-jump"):
-        assert hardest(make_task(name)) == make_task(name)
 
 
 def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates(tmp_path):
@@ -338,3 +336,40 @@ def test_shac_experiment_reports_curves_and_gradient_noise_and_refuses_empty_win
     assert (tmp_path / "variance.png").is_file() and (tmp_path / "curves.png").is_file()
     with pytest.raises(InputError, match="positive times and horizons"):
         replace(args, horizons=(0,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "flags", "message"),
+    [
+        (attitude.Args, {"num_turns": 3}, "num_turns must be at least 6"),
+        (departures.Args, {"only": ("bracing",)}, "not bracing"),
+        (departures.Args, {"iterations": 0}, "at least 1"),
+        (flight_attitude.Args, {"takeoff": "policy"}, "takeoff by a policy needs one"),
+        (flight_attitude.Args, {"height_range": (2.0, 1.0)}, "height_range must be in"),
+        (identification_starts.Args, {"shard": "3/2"}, "shard must be K/N"),
+        (learning_curves.Args, {"variants": ("faster",)}, "variants are default, .*, got 'faster'"),
+        (leg_springs.Args, {"stiffness": (-1.0,)}, "spring_stiffness must be in"),
+        (measure_policies.Args, {"policies": ("high_jump",)}, "no 'high_jump'; there are attitude"),
+        (open_loop_jump.Args, {"robot": Path("heavy.json"), "spring": (1000.0, 0.17)}, "springs or a robot"),
+        (paper_trainings.Args, {"arms": ("no_rewards",)}, "not no_rewards"),
+        (squat_hold.Args, {"height": (1.0, 0.5)}, "height must be in"),
+        (trajectory_optimization.Args, {"jumps": ("wings",)}, "no jump 'wings'"),
+        (walk_jump_walk.Args, {"num_robots": 0}, "robots"),
+        (walking_terrain.Args, {"speed": 0.9}, "speed"),
+        (walking_tracking.Args, {"commands_per_axis": 1}, "commands_per_axis"),
+    ],
+)
+def test_refuses_invalid_flags(kind, flags, message):
+    with pytest.raises(InputError, match=message):
+        kind(**flags)
+
+
+@pytest.mark.parametrize(
+    ("script", "suite"),
+    [(attitude, "suite attitude"), (flight_attitude, "needs a policy that turns"), (walk_jump_walk, "suite velocity"),
+     (walking_tracking, "suite velocity")],
+)  # fmt: skip
+def test_refuses_policy_of_another_task(script, suite, tmp_path):
+    policy = "horizontal_jump" if script is flight_attitude else "vertical_jump"
+    with pytest.raises(PolicyError, match=suite):
+        script.main(script.Args(policy=policy, out=tmp_path, device="cpu"))
