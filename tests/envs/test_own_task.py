@@ -16,7 +16,7 @@ from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
+from jumper_warp.tasks.saving import task_from_json, task_to_json
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/helpers/hold_height.py"
@@ -258,14 +258,6 @@ def replaced(saved, place, value):
 
 
 SAVED = task_to_json(hold_height.hold_height())
-
-
-@pytest.mark.parametrize("place", list(places(SAVED)), ids=lambda place: ".".join(map(str, place)))
-def test_refuses_a_name_outside_the_given_modules(place):
-    for name in ("os:system", "builtins:exec", "trap:advance_hold", "hold_height:os", "jumper_warp.tasks.saving:sys"):
-        with pytest.raises(TaskError) as caught:
-            task_from_json(replaced(SAVED, place, name), [hold_height])
-        assert "\n" not in str(caught.value) and f"needs {name!r}" in str(caught.value)
 
 
 def test_loading_a_configuration_imports_no_module(tmp_path):

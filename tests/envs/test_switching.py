@@ -11,7 +11,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.courses import SQUAT_TIME, CourseLog
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.overlay import RobotOverlay
 
@@ -116,13 +116,6 @@ def test_jumps_are_commanded_squat_time_after_the_handover_and_walking_starts_st
     first = switches[[s.target for s in switches].index(JUMP_TO)]
     way = first.state["goal"][:2] - first.after[:2]
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)
-
-
-def test_refuses_policies_of_other_tasks():
-    with pytest.raises(PolicyError, match=r"suite velocity, got one of task vertical-jump"):
-        SkillPolicies(SkillNames(walk="vertical_jump"))
-    with pytest.raises(PolicyError, match=r"suite landing_position or omnidirectional, got one of task velocity-flat"):
-        SkillPolicies(SkillNames(jump_to="walking_flat"))
 
 
 def test_configuration_names_all_tasks_and_handovers(followed):

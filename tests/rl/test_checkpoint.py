@@ -57,12 +57,6 @@ def test_nan_score_counts_as_no_score(tmp_path):
     assert best_checkpoint(tmp_path) == best
 
 
-def test_best_checkpoint_without_scores_is_the_newest(tmp_path):
-    save_checkpoint(tmp_path, state(1))
-    newest = save_checkpoint(tmp_path, state(2))
-    assert best_checkpoint(tmp_path) == newest
-
-
 def flip(path):
     """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
@@ -75,26 +69,8 @@ def cut(path):
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def empty_manifest(path):
-    """Remove all entries from the manifest in a checkpoint's folder."""
-    (path.parent / MANIFEST).write_text("{}")
-
-
-def break_manifest(path):
-    """Write a manifest whose entry for the checkpoint is a number."""
-    (path.parent / MANIFEST).write_text('{"iteration_000002.pt": 3}')
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (flip, "differs from its checksum"),
-        (cut, "differs from its checksum"),
-        (os.remove, "no such file .checkpoint of a training"),
-        (empty_manifest, "has no checksum"),
-        (break_manifest, "manifest.json: not readable"),
-        (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: no such file"),
-    ],
+    ("damage", "message"), [(flip, "differs from its checksum"), (os.remove, "no such file .checkpoint of a training")]
 )
 def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):
     path = save_checkpoint(tmp_path, state(2))
@@ -121,12 +97,6 @@ def test_loading_a_checkpoint_executes_no_code(tmp_path, monkeypatch):
     assert (tmp_path / "executed").exists()
 
 
-def test_refuses_a_checkpoint_with_missing_parts(tmp_path):
-    path = save_checkpoint(tmp_path, {"iteration": 1, "ppo": {}})
-    with pytest.raises(CheckpointError, match="lacks env, rng, config"):
-        load_checkpoint(path)
-
-
 def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
     cut(paths[2])
@@ -134,12 +104,6 @@ def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     path, loaded, skipped, _ = latest_checkpoint(tmp_path)
     assert (path, loaded["iteration"]) == (paths[0], 1)
     assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
-
-
-def test_latest_checkpoint_raises_if_all_are_damaged(tmp_path):
-    cut(save_checkpoint(tmp_path, state(1)))
-    with pytest.raises(CheckpointError, match=r"no usable checkpoint.*differs from its checksum"):
-        latest_checkpoint(tmp_path)
 
 
 def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch):

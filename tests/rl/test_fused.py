@@ -6,17 +6,7 @@ import importlib.util
 import pytest
 import torch
 
-from fused_runs import (
-    FUSED,
-    NoiseTask,
-    compiled_variants,
-    failed_compilation,
-    interpreted,
-    iterations,
-    minibatch_gradients,
-    update_rank,
-    whole_and_resumed,
-)
+from fused_runs import FUSED, NoiseTask, interpreted, iterations, minibatch_gradients, update_rank, whole_and_resumed
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
@@ -74,22 +64,6 @@ def test_iteration_agrees_with_pytorch():
                 torch.testing.assert_close(fused[1]["model"][name], theirs, atol=1e-4, rtol=1e-4, msg=name)
         torch.testing.assert_close(fused[1]["lr"], eager[1]["lr"])
         assert fused[1]["optimiser"][0]["step"] == 2.0
-
-
-@needs_triton
-def test_kernels_that_do_not_compile_are_an_input_error():
-    assert interpreted(failed_compilation).startswith(
-        "the fused kernels do not work here, pass --ppo.no-fused: RuntimeError shape '[3]'"
-    )
-
-
-@needs_triton
-def test_each_variant_of_a_kernel_is_compiled_once_and_not_launched():
-    compiled, meanwhile, afterwards, message = interpreted(compiled_variants)
-    options = ((7,), 8, 3)
-    assert compiled == [(False, 3, *options), (True, 3, *options), (True, 4, *options)]
-    assert (meanwhile, afterwards) == (0, 4)
-    assert message == "does not compile"
 
 
 @needs_triton

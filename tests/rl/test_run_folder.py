@@ -77,16 +77,6 @@ def test_stop_on_nan_ends_with_a_checkpoint_of_that_iteration(cfg, trainer, log_
     assert (folder / last).is_file()
 
 
-def test_dump_that_cannot_be_written_is_reported(cfg, capsys, monkeypatch):
-    def refuse(path, *_, **__):
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr("jumper_warp.rl.run_folder.write_dump", refuse)
-    result = train(cfg, FaultyTask)
-    path = result.folder / "non_finite" / "rewards.tilt.npz"
-    assert f"{LINE}; {path}: No space left on device" in capsys.readouterr().err.splitlines()
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # in SummaryWriter's thread
 @TRAINERS
 def test_training_whose_folder_is_deleted_ends_and_saves_the_rest_beside_it(cfg, trainer, capsys):

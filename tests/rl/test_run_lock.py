@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -62,11 +61,6 @@ def test_lock_file_of_a_killed_process_does_not_block(cfg, holder):
     assert train(cfg, PushTask).iteration == 4
 
 
-def test_copy_of_a_run_can_be_resumed_while_the_run_is_written(cfg, holder):
-    copy = shutil.copytree(cfg.resume, Path(cfg.resume).with_name("copy"))
-    assert train(dataclasses.replace(cfg, resume=str(copy)), PushTask).folder == copy
-
-
 class LockedDuringTraining(PushTask):
     """Task that checks in each step that no other writer gets the lock of the only run."""
 
@@ -93,9 +87,3 @@ def test_checkpoint_saved_by_another_process_meanwhile_is_not_overwritten(cfg):
     train(cfg, PushTask)
     with pytest.raises(CheckpointError, match="another process has saved a checkpoint; resume again"):
         train(cfg, PushTask, checkpoint=checkpoint)
-
-
-def test_lock_file_beside_a_folder_is_removed(tmp_path):
-    with write_lock(tmp_path / "tuned", tmp_path / ".tuned.lock"):
-        assert (tmp_path / ".tuned.lock").is_file()
-    assert not any(tmp_path.iterdir())

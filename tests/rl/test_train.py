@@ -70,12 +70,12 @@ def test_logged_iterations_are_printed(cfg, capsys):
 def resume_after(cfg, seconds, limit):
     """Resume a checkpoint of 2 iterations; return the `TrainingRun` and its result.
 
-    seconds: training time in the checkpoint [s], None: missing. limit: max_seconds [s].
+    seconds: training time in the checkpoint [s]; limit: max_seconds [s].
     """
     half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
-    save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
+    save_checkpoint(half.folder / CHECKPOINTS, {**state, "seconds": seconds})
     cfg = dataclasses.replace(cfg, max_iterations=100_000, max_seconds=limit, resume=str(half.folder))
     run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     with StopRequest() as stop:
@@ -94,16 +94,6 @@ def test_resumed_run_past_its_time_limit_ends_immediately(cfg):
     assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
 
 
-def test_resume_without_saved_time_counts_from_zero(cfg):
-    result = resume_after(cfg, None, limit=0.3)[1]
-    assert 0.3 <= final_state(result)["seconds"] <= result.seconds < 5.0
-
-
-def test_refuses_a_checkpoint_with_a_malformed_time_in_one_line(cfg):
-    with pytest.raises(CheckpointError, match=r"does not fit these settings: seconds must be .*'late'"):
-        resume_after(cfg, "late", limit=100.0)
-
-
 def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     result = train(cfg, make_env)
     (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
@@ -114,13 +104,6 @@ def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     assert "iteration_000002.pt" in stderr
 
 
-def test_refuses_to_resume_a_damaged_checkpoint_by_name(cfg):
-    path = train(cfg, make_env).folder / CHECKPOINTS / "iteration_000004.pt"
-    path.write_bytes(b"cut")
-    with pytest.raises(CheckpointError, match="differs from its checksum"):
-        train(dataclasses.replace(cfg, resume=str(path)), make_env)
-
-
 @pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric_critic": False}])
 def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg, change):
     result = train(cfg, make_env)
@@ -128,22 +111,6 @@ def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg, change):
     with pytest.raises(CheckpointError, match="does not fit these settings") as caught:
         train(other, make_env)
     assert "\n" not in str(caught.value)
-
-
-def test_refuses_a_checkpoint_without_the_critics_statistics_in_one_line(cfg):
-    result = train(cfg, make_env)
-    old = final_state(result)
-    for name in ("mean", "var", "count"):
-        del old["ppo"]["model"][f"critic_moments.{name}"]
-    save_checkpoint(result.folder / CHECKPOINTS, old)
-    with pytest.raises(CheckpointError, match=r"does not fit these settings: .*critic_moments") as caught:
-        train(dataclasses.replace(cfg, resume=str(result.folder)), make_env)
-    assert "\n" not in str(caught.value)
-
-
-def test_resume_latest_raises_without_a_run(cfg):
-    with pytest.raises(CheckpointError, match="no run to resume"):
-        train(dataclasses.replace(cfg, resume="latest"), make_env)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -164,16 +131,6 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
     *_, cause, last = capsys.readouterr().err.splitlines()
     assert cause == "ended by an interruption after 0.00 M of 0.05 M steps"
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
-
-
-def test_second_interrupt_raises_immediately(cfg):
-    class InterruptingTask(PushTask):  # sends Ctrl-C to this process at every step
-        def step(self, action):
-            super().step(action)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg, InterruptingTask)
 
 
 def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
@@ -236,33 +193,13 @@ def test_each_rank_resumes_its_own_worlds(cfg):
     [
         ({"max_iterations": 0}, "max_iterations must be a whole number of 1 to 1000000000, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
-        ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
-        ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
-        ({"seed": 2**31}, "seed must be in"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
     ],
 )
 def test_refuses_settings_out_of_range(change, message):
     with pytest.raises(ValueError, match=message):
         TrainCfg(**change)
-
-
-def must_not_be_built(num_envs, seed, device):
-    """Fail the test in place of making an environment."""
-    pytest.fail("the environment was built")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"ppo": dataclasses.replace(SMALL, minibatches=7)}, "7 minibatches do not divide 16 x 32 samples"),
-        ({"num_envs": 1, "ppo": dataclasses.replace(SMALL, num_steps=1, minibatches=1)}, "at least 2 samples"),
-    ],
-)
-def test_refuses_indivisible_batches_before_the_env_is_built(cfg, change, message):
-    with pytest.raises(ValueError, match=message):
-        train(dataclasses.replace(cfg, **change), must_not_be_built)
 
 
 def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
@@ -284,21 +221,6 @@ def test_every_logged_metric_can_be_the_best_metric(cfg):
     for name in metrics:
         TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     assert {"Train/mean_reward", "Perf/total_fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
-
-
-def test_trains_with_the_largest_seed(cfg):
-    assert train(dataclasses.replace(cfg, seed=2**31 - 1, max_iterations=1), make_env).iteration == 1
-
-
-def test_log_root_may_be_a_string(cfg):
-    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), max_iterations=1), make_env)
-    assert result.folder.parent == cfg.log_root / "push"
-
-
-def test_refuses_a_missing_device(cfg, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match="torch finds no GPU"):
-        train(dataclasses.replace(cfg, device="cuda"), make_env)
 
 
 def test_rsl_rl_adapter_returns_copies():
