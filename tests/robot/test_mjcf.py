@@ -17,7 +17,6 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.assets import ASSETS
-from jumper_warp.utils.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 FILE = ASSETS / "jumper" / "jumper.xml"
@@ -186,10 +185,3 @@ def test_command_names_the_values_that_a_format_cannot_hold(tmp_path, capsys):
     masses = [float(mass.get("value")) for mass in ElementTree.parse(lines[-1]).iter("mass")]
     assert sum(masses) == pytest.approx(sum(inertia.mass for inertia in heavier.inertias))
     assert sum(masses) == pytest.approx(14.5 + 0.57)  # [kg]
-
-
-def test_solver_refuses_to_write_a_robot_with_open_loops(tmp_path):
-    file = tmp_path / "robot.xml"
-    with pytest.raises(InputError, match="jumper export robot"):
-        mujoco_solver(build_model(1, visuals=False, device="cpu"), save_to_mjcf=str(file))
-    assert not file.exists()

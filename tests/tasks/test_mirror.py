@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from columns import ANG_VEL, LIN_VEL, POS, QUAT
-from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.tasks.cfg import ObservationsCfg
 from jumper_warp.tasks.mirror import LEGS, MOTORS, mirror_of, mirror_of_action
 from jumper_warp.tasks.terms import ObservationTerm
-from jumper_warp.utils.errors import InputError
 from velocity_helpers import edit, states_of, walking_env
 
 HALF = 8  # worlds
@@ -121,11 +119,3 @@ def test_mirroring_twice_is_the_identity():
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)
-
-
-def test_refuses_a_term_without_a_known_mirror_image():
-    asymmetric = dataclasses.replace(
-        make_task("velocity-flat"), observations=ObservationsCfg(actor=(), critic=(ObservationTerm(obs.drawn_push),))
-    )
-    with pytest.raises(InputError, match="mirror image of drawn_push is not known"):
-        mirror_of(asymmetric, "critic")

@@ -1,42 +1,14 @@
 import json
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
-from rich.console import Console
 
-import jumper_warp
 from jumper_warp.utils import output, runtime
 from jumper_warp.utils.metrics import MetricValue, unit_of
-
-
-def test_default_output_folder_is_name_and_time(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    folder = output.output_dir("jump")
-    assert folder.is_dir()
-    assert folder.parent.as_posix() == "outputs/jump"
-    assert [len(part) for part in folder.name.split("_")] == [len("2026-01-31"), len("23-59-59")]  # date_time
-
-
-def test_two_runs_never_share_a_default_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert len({output.output_dir("jump") for _ in range(3)}) == 3
-
-
-def test_given_output_folder_is_used_unchanged(tmp_path):
-    assert output.output_dir("jump", tmp_path / "a" / "b") == tmp_path / "a" / "b"
-    assert output.output_dir("jump", tmp_path / "a" / "b").is_dir()
-
-
-@pytest.mark.parametrize("name", ["", "..", "a/b", "/tmp"])
-def test_refuses_a_name_that_is_not_one_path_component(name):
-    with pytest.raises(ValueError, match="one path component"):
-        output.output_dir(name)
 
 
 def test_metrics_file_holds_the_given_metrics(tmp_path):
@@ -89,25 +61,6 @@ def test_refuses_a_non_finite_metric_by_name_and_writes_nothing(tmp_path, bad, a
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("nested", [{"x": 1}, [[1]], np.zeros(2), object()])
-def test_refuses_a_nested_metric_by_name(tmp_path, nested):
-    with pytest.raises(TypeError, match="apex"):
-        output.write_metrics(tmp_path, {"apex": nested})
-
-
-def test_failed_write_keeps_the_old_metrics(tmp_path, monkeypatch):
-    output.write_metrics(tmp_path, {"apex": 1.0})
-
-    def full_disk(*_):
-        raise OSError(28, "no space left")
-
-    monkeypatch.setattr(os, "replace", full_disk)
-    with pytest.raises(OSError, match="no space left"):
-        output.write_metrics(tmp_path, {"apex": 2.0})
-    assert output.read_values(tmp_path) == {"apex": 1.0}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "run.json"]
-
-
 def test_run_json_has_versions_and_command_but_no_environment_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("SOME_TOKEN", "hush-4711")
     monkeypatch.setattr(sys, "argv", ["/home/someone/experiments/jump.py", "--torque", "18"])
@@ -128,14 +81,6 @@ def _git(folder, *arguments):
     return done.stdout.strip()
 
 
-def test_commit_is_none_outside_git_and_before_the_first_commit(tmp_path):
-    assert runtime.git_commit(tmp_path) is None
-    _git(tmp_path, "init")
-    (tmp_path / "file").write_text("1")
-    _git(tmp_path, "add", "file")
-    assert runtime.git_commit(tmp_path) is None
-
-
 def test_commit_is_head_and_detects_untracked_files(tmp_path):
     _git(tmp_path, "init")
     (tmp_path / "package").mkdir()
@@ -146,37 +91,3 @@ def test_commit_is_head_and_detects_untracked_files(tmp_path):
     assert runtime.git_commit(tmp_path / "package") == (head, False)
     (tmp_path / "beside").write_text("2")
     assert runtime.git_commit(tmp_path / "package") == (head, True)
-
-
-def test_commit_is_none_for_an_untracked_folder_of_another_project(tmp_path):
-    _git(tmp_path, "init")
-    (tmp_path / ".gitignore").write_text(".venv\n")
-    _git(tmp_path, "add", ".")
-    _git(tmp_path, "commit", "-m", "Begin")
-    installed = tmp_path / ".venv" / "jumper_warp"
-    installed.mkdir(parents=True)
-    assert runtime.git_commit(installed) is None
-
-
-def test_device_report_is_one_line(monkeypatch):
-    monkeypatch.setattr("jumper_warp.utils.threads._default_threads", 3)
-    console = Console(record=True, width=40, quiet=False)
-    info = runtime.report_device("cpu", console)
-    lines = console.export_text().splitlines()
-    assert len(lines) == 1
-    assert info == ("cpu", info.name, None, False, True)  # alias, name, driver, mempool, graphs
-    found = "" if wp.is_cuda_available() else "; no CUDA GPU found"
-    assert lines[0] == f"device: cpu (3 threads){found}"
-
-
-def test_warp_is_initialised_without_its_notice_about_a_missing_gpu():
-    code = "import warp as wp; from jumper_warp.utils.runtime import configure_device; configure_device('cpu')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "" and len(done.stderr.splitlines()) == 1 and done.stderr.startswith("device: cpu (")
-
-
-def test_versions_include_python_and_none_for_a_missing_package(monkeypatch):
-    monkeypatch.setattr(runtime, "PACKAGES", ("numpy", "no-such-package-here"))
-    version = ".".join(map(str, sys.version_info[:3]))
-    packages = {"jumper-warp": jumper_warp.__version__, "numpy": np.__version__, "no-such-package-here": None}
-    assert runtime.versions() == {"python": version, **packages}

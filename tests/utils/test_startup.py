@@ -1,7 +1,6 @@
 """Start of a command's process: modules that are executed at their first use."""
 
 import importlib
-import inspect
 import subprocess
 import sys
 
@@ -35,23 +34,6 @@ def test_module_is_executed_at_the_first_use_of_a_name(module):
     assert module.RUNS == [module] and type(module) is type(sys)
 
 
-def test_names_of_the_import_system_do_not_execute_it(module):
-    importlib.import_module("slow_package.slow")
-    assert module.__file__ == module.__spec__.origin and inspect.getmodule(executed) is sys.modules[__name__]
-    assert not executed(module)
-
-
-def test_import_of_a_name_executes_it(module):
-    from slow_package.slow import VALUE
-
-    assert VALUE == 3
-
-
-def test_missing_name_raises(module):
-    with pytest.raises(AttributeError, match="NONE"):
-        _ = module.NONE
-
-
 def test_commands_import_newton_without_its_viewer():
     code = (
         "import sys; from jumper_warp.utils.startup import prepare_imports; prepare_imports(); import newton;"
@@ -59,16 +41,3 @@ def test_commands_import_newton_without_its_viewer():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.split() == ["False", "ViewerNull", "True"]
-
-
-def test_first_garbage_collection_is_late_and_there_is_none_at_the_end():
-    code = (
-        "import gc; from jumper_warp.utils.startup import prepare_imports; prepare_imports()\n"
-        "print(gc.get_threshold()[0]); gc.collect(); print(gc.get_threshold()[0])\n"
-        "class Cycle:\n"
-        "    def __init__(self): self.me = self\n"
-        "    def __del__(self): print('collected')\n"
-        "Cycle(); print('end')"
-    )
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert output.split() == [str(startup.FIRST_COLLECTION_THRESHOLD), str(startup.COLLECTION_THRESHOLD), "end"]

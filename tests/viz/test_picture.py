@@ -1,19 +1,13 @@
 """Composite pictures of hand-made jumps and walks."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import ndimage
 
 from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
 from columns import XY, X, Y, Z
-from jumper_warp.evaluation.recorder import save_recording
-from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import picture
 from jumper_warp.viz.picture import GAP, MOST, SIDE_BY_SIDE, SPREAD, compose, write_picture
-from jumper_warp.viz.props import with_blocks
 
 GRAVITY = 9.81  # [m/s²]
 SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST = 12, 20, 44, 68, 88  # frames of `jump`
@@ -104,13 +98,6 @@ def test_hops_in_place_show_the_first_and_then_apexes_over_time_without_their_pa
     assert all(label.point[Z] < scene.lowest for label in times)
 
 
-def test_jumps_ahead_are_shown_to_the_end():
-    positions, forces = jump(0.4)
-    hops = np.concatenate([positions + [0.4 * i, 0.0, 0.0] for i in range(12)])
-    scene = compose(box_recording(hops, forces=np.tile(forces, 12)))
-    assert {0, len(hops) - 1} <= set(scene.frames) and len(scene.frames) == MOST
-
-
 @pytest.mark.parametrize("distance", [0.0, 1.5])
 def test_front_view_shows_the_robots_side_by_side(distance):
     scene = compose(jump_recording(distance), eye=(3.0, 0.0, 0.5))
@@ -118,14 +105,6 @@ def test_front_view_shows_the_robots_side_by_side(distance):
     assert np.diff(scene.bases[:, Y]) == pytest.approx(SPREAD) and len(scene.frames) == 7
     axis, *_ = (line.points for line in picture._lines(scene))
     assert axis[:, X].min() > scene.bases[:, X].max()  # in front of all robots
-
-
-@pytest.mark.parametrize("height", np.arange(0.35, 1.0, 0.05))
-def test_labels_of_robots_are_not_on_the_bar_of_the_commanded_height(height):
-    scene = compose(jump_recording(heights=np.array([height], np.float32)))
-    for label in picture._labels(scene):
-        if label.anchor == "md":
-            assert not label.point[Z] - 0.02 < height < label.point[Z] + 0.12
 
 
 def test_lifted_paws_without_rise_are_no_jump():
@@ -140,22 +119,6 @@ def test_moments_of_a_walk_are_side_by_side(distance, moments):
     gaps = np.diff(scene.bases[:, X])
     assert len(scene.frames) == moments and not scene.shift.any()
     assert gaps.min() >= min(SIDE_BY_SIDE, 0.95 * distance) - 0.05 and gaps.max() < 1.1 * gaps.min()
-
-
-@pytest.mark.parametrize(("distance", "hides"), [(0.0, False), (0.7, True), (1.5, True)])
-def test_apex_is_opaque_and_moments_that_would_hide_others_are_not(distance, hides):
-    positions, forces = jump(distance, gravity=4.0)  # [m/s²] low: takeoff and touchdown are near the apex
-    scene = compose(box_recording(positions, forces=forces))
-    opacity = picture._opacity(scene)
-    assert opacity[list(scene.frames).index(APEX)] == 1.0
-    assert (opacity < 1.0).any() == hides
-
-
-def test_moments_are_drawn_at_their_places(tmp_path):
-    path = write_picture(jump_recording(), tmp_path / "jump.png", width=640)
-    with Image.open(path) as image:
-        _, blobs = ndimage.label(ndimage.binary_opening(colored(image, 1), iterations=2))
-    assert blobs == 7
 
 
 def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_path, monkeypatch):
@@ -190,40 +153,6 @@ def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_pat
     assert list(compose(recording, 1).heights) == [pytest.approx(0.9)]
 
 
-def test_blocks_move_with_their_world_and_do_not_change_the_moments(tmp_path):
-    positions, forces = jump(1.5)
-    recording = box_recording(np.stack([positions, positions], axis=1), forces=forces)
-    centers = np.tile([1.5, 0.0], (REST + 1, 2, 1))
-    shown = with_blocks(recording, centers, np.full((2, 2), 0.3), np.array([0.1, 0.1]))
-    for rank in (0, 1):
-        np.testing.assert_array_equal(compose(shown, rank).frames, compose(recording, rank).frames)
-        with Image.open(write_picture(shown, tmp_path / "block.png", rank=rank, width=WIDTH)) as image:
-            assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-@pytest.mark.parametrize(("top", "step"), [(0.3, 0.25), (1.4, 0.25), (2.9, 0.5), (5.0, 1.0), (90.0, 16.0)])
-def test_scale_of_heights_has_few_marks_up_to_the_apex(top, step):
-    recording = box_recording(np.stack([[distance, 0.0, top] for distance in (0.0, 1.0)]))
-    marks = picture._ticks(compose(recording))
-    assert np.diff(marks) == pytest.approx(step) and len(marks) <= 8
-    assert marks[0] == 0.0 and top - step < marks[-1] <= top + 0.1
-
-
-@pytest.mark.parametrize("frames", [1, 2, 30])
-def test_robot_that_never_moves_is_shown_once(tmp_path, frames):
-    recording = box_recording(np.tile([1.0, 2.0, STANDING], (frames, 1)))
-    assert list(compose(recording).frames) == [0]
-    with Image.open(write_picture(recording, tmp_path / "still.png", width=WIDTH)) as image:
-        assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-def test_recording_that_ends_in_flight_shows_no_moment_twice():
-    recording = jump_recording()
-    part = {name: getattr(recording, name)[:APEX] for name in ("times", "poses", "contact_points", "contact_forces")}
-    frames = compose(replace(recording, **part)).frames
-    assert len(set(frames)) == len(frames) and frames[-1] == APEX - 1
-
-
 @pytest.mark.parametrize("value", [np.nan, 1.0e9])
 @pytest.mark.parametrize(("distance", "first"), [(0.0, TAKEOFF + 5), (1.5, TOUCHDOWN + 3)])
 def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
@@ -233,34 +162,6 @@ def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
     assert compose(recording).frames.max() < first
     with Image.open(write_picture(recording, tmp_path / "lost.png", width=WIDTH)) as image:
         assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-def test_recording_without_a_finite_pose_is_refused_in_one_line_and_still_written_for_the_viewer(tmp_path):
-    recording = jump_recording()
-    recording.poses[:] = np.nan
-    with pytest.raises(InputError, match="world_0: no picture, the poses of the first frame are not finite") as error:
-        save_recording(recording, tmp_path, "lost")
-    assert "\n" not in str(error.value) and [file.name for file in tmp_path.iterdir()] == ["lost.rrd"]
-
-
-@pytest.mark.parametrize(("suffix", "kind"), [(".png", "PNG"), (".webp", "WEBP"), (".jpg", "JPEG")])
-def test_file_has_the_format_of_its_suffix_and_the_width(tmp_path, suffix, kind):
-    path = write_picture(jump_recording(1.5), tmp_path / "new" / f"jump{suffix}", width=WIDTH + 1)
-    with Image.open(path) as image:
-        assert (image.format, image.size[0]) == (kind, WIDTH + 1)
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize(
-    ("name", "width"), [("jump.gif", 240), ("jump", 240), ("jump.png", 199), ("jump.png", 8001), ("jump.png", -1)]
-)
-def test_bad_suffix_and_width_are_refused_before_drawing(tmp_path, monkeypatch, name, width):
-    monkeypatch.setattr(picture, "open_renderer", None)
-    with pytest.raises(
-        InputError, match=rf"{name}: a picture needs suffix \.png, \.webp, \.jpg and width 200 to 8000 px"
-    ):
-        write_picture(jump_recording(), tmp_path / name, width=width)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("eye", "toward"), [(None, (0.0, -1.0)), ((4.0, 3.0, 1.0), (0.8, 0.6))])

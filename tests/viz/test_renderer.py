@@ -2,14 +2,12 @@
 
 import math
 import os
-import sys
 
 import numpy as np
 import pytest
 import trimesh
 
 from box_robot import colored, pinhole, shape
-from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import renderer as module
 from jumper_warp.viz.renderer import GLRenderer, Line, RayTracer, View, open_renderer
 
@@ -96,16 +94,6 @@ def test_renderers_draw_in_turn_while_others_open_and_close(kind):
     second.close()
 
 
-def test_windows_are_used_again(opengl):
-    """A closed renderer's window, closed once or twice, goes to the next renderer and to no other."""
-    renderer = GLRenderer([BALL], 1, SIZE)
-    window = renderer._viewer
-    renderer.close()
-    renderer.close()
-    with GLRenderer([FIXED], 1, SIZE) as first, GLRenderer([BALL], 1, SIZE) as second:
-        assert window is first._viewer is not second._viewer
-
-
 def test_loaded_bodies_replace_those_before(kind):
     with kind([BALL], 1, SIZE) as renderer:
         renderer.draw(poses((0.0, 0.0, 0.0)), VIEW)
@@ -178,31 +166,9 @@ def test_arrow_has_its_head_at_the_last_point(opengl):
     assert end.max() >= 2 * start.max()
 
 
-def test_polyline_of_the_ray_tracer_changes_nothing():
-    line = Line(np.array([[0.0, 0.6, 0.4], [0.0, -0.6, 0.4]]), (0.0, 0.0, 1.0))
-    with RayTracer([BALL], 1, SIZE) as renderer:
-        images = [renderer.draw(poses((0.0, 0.0, 0.0)), VIEW, lines) for lines in ([], [line])]
-    np.testing.assert_array_equal(*images)
-
-
-def test_renderers_that_are_open_together_draw_their_own_scene(kind):
-    with kind([BALL], 1, SIZE) as first, kind([FIXED], 1, (64, 64)) as second:
-        images = [renderer.draw(poses((0.0, 0.0, 0.0)), VIEW) for renderer in (first, second, first)]
-    assert [image.shape for image in images] == [(64, 96, 3), (64, 64, 3), (64, 96, 3)]
-    assert [bool(colored(image, RED).any()) for image in images] == [True, False, True]
-    assert [bool(colored(image, BLUE).any()) for image in images] == [False, True, False]
-
-
 def test_points_behind_the_eye_have_no_pixel():
     pixels = VIEW.project(np.array([[-2.5, 0.0, 0.0], [0.0, 0.0, 0.0]]), SIZE)
     assert np.isnan(pixels[0]).all() and pixels[1] == pytest.approx([48.0, 32.0])
-
-
-@pytest.mark.parametrize("eye", [(0.0, 0.0, 2.0), (1.0, 2.0, 3.0)])
-def test_vertical_view_is_refused_in_one_line(one_ball, eye):
-    with pytest.raises(InputError, match=r"^the view from \(\S+, \S+, \S+\) to .* is vertical$") as error:
-        one_ball.draw(poses((0.0, 0.0, 0.0)), View(np.array(eye), np.array([*eye[:2], 0.0])))
-    assert "float" not in str(error.value)
 
 
 def test_ray_tracing_replaces_missing_opengl_and_names_the_packages_to_install(capsys, monkeypatch):
@@ -216,25 +182,3 @@ def test_ray_tracing_replaces_missing_opengl_and_names_the_packages_to_install(c
         assert isinstance(renderer, RayTracer)
     (line,) = capsys.readouterr().err.splitlines()
     assert "NoSuchDisplayException" in line and 'pip install "jumper-warp[video]"' in line and "apt-get install" in line
-
-
-def test_ray_tracing_replaces_missing_pyglet(capsys, monkeypatch):
-    monkeypatch.setattr(GLRenderer, "_idle", {})
-    monkeypatch.setitem(sys.modules, "pyglet", None)
-    assert isinstance(open_renderer([BALL], 1, SIZE), RayTracer)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "pyglet" in line and 'pip install "jumper-warp[video]"' in line
-
-
-def test_any_failure_of_the_viewer_counts_as_missing_opengl(monkeypatch):
-    class Failure(Exception):
-        pass
-
-    def fail(**_):
-        raise Failure("old driver")
-
-    pytest.importorskip("pyglet")
-    monkeypatch.setattr(GLRenderer, "_idle", {})
-    monkeypatch.setattr(module.newton.viewer, "ViewerGL", fail)
-    with pytest.raises(RuntimeError, match="Failure: old driver"):
-        GLRenderer([BALL], 1, SIZE)

@@ -106,19 +106,6 @@ def test_arrows_show_commanded_velocity_of_a_turned_robot_and_its_actual_velocit
     assert arrows[1].points[0] == pytest.approx(start)
 
 
-@pytest.mark.parametrize("frame", [0, 60])
-def test_actual_velocity_at_the_ends_of_a_recording(frame):
-    recording = box_recording(walk(0.6, 1.0), commands=np.zeros((61, 1, 3), np.float32))
-    (arrow,) = velocity_arrows(recording, frame, 0, np.zeros(3))  # a command of zero has no arrow
-    assert (arrow.points[-1] - arrow.points[0]) / ARROW_SECONDS == pytest.approx([0.6, 0.0, 0.0], abs=1e-5)
-
-
-def test_no_arrows_without_commands_and_in_a_recording_of_one_frame():
-    assert velocity_arrows(box_recording(walk(1.0)), 3, 0, np.zeros(3)) == []
-    still = box_recording([[0.0, 0.0, 0.3]], commands=np.zeros((1, 1, 3), np.float32))
-    assert velocity_arrows(still, 0, 0, np.zeros(3)) == []
-
-
 def ink(image):
     """Return rows and columns of the dark pixels of an image."""
     return np.nonzero(np.asarray(image).max(axis=2) < 90)
@@ -133,22 +120,6 @@ def test_label_stands_above_its_point_and_is_skipped_behind_the_eye():
     assert 0.5 * (columns.min() + columns.max() + 1) == pytest.approx(column, abs=1.5)
     assert row - 5.0 < rows.max() <= row  # [px] above the point, by the font's descent
     assert (grey == 160).all()
-
-
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_label_at_the_edge_is_whole_and_a_label_outside_is_not_moved_inside(side):
-    grey, view = np.full((120, 200, 3), 160, np.uint8), View(np.array([-3.0, 0.0, 0.0]), np.zeros(3))
-    middle, edge, outside = (ink(annotate(grey, view, [Label("HH", np.array([0.0, y, 0.0]))], size=0.1))[1]
-                             for y in (0.0, side * 1.32, side * 3.0))  # fmt: skip
-    assert np.ptp(edge) == np.ptp(middle) and edge.min() > 0 and edge.max() < 199
-    assert not outside.size
-
-
-def test_heading_is_in_the_upper_left_corner():
-    view = View(np.array([-3.0, 0.0, 0.0]), np.zeros(3))
-    rows, columns = ink(annotate(np.full((120, 200, 3), 160, np.uint8), view, [], "HH", 0.1))
-    assert 0 < rows.min() and rows.max() < 30 and 0 < columns.min() and columns.max() < 50
-    assert not ink(annotate(np.full((120, 200, 3), 160, np.uint8), view, []))[0].size
 
 
 def test_block_that_waits_far_away_is_no_divergence():  # courses keep their block 1 km away until it is needed
