@@ -1,13 +1,12 @@
 import json
 import math
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jumper_warp.utils import output, runtime
+from jumper_warp.utils import output
 from jumper_warp.utils.metrics import MetricValue, unit_of
 
 
@@ -48,11 +47,6 @@ def test_unit_is_read_from_the_end_of_the_key(key, unit):
     assert unit_of(key) == unit
 
 
-def test_numpy_scalars_are_written_as_numbers(tmp_path):
-    output.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
-    assert output.read_values(tmp_path) == {"a": 0.5, "b": [3], "c": True}
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float32("nan")])
 @pytest.mark.parametrize(("as_metric", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
 def test_refuses_a_non_finite_metric_by_name_and_writes_nothing(tmp_path, bad, as_metric, name):
@@ -72,22 +66,3 @@ def test_run_json_has_versions_and_command_but_no_environment_variables(tmp_path
     assert run["versions"]["newton"].startswith("1.8.")
     assert run["device"]["alias"].startswith(("cpu", "cuda"))
     assert "hush" not in text and "/home" not in text
-
-
-def _git(folder, *arguments):
-    """Run git in a folder with a made-up author; return its output."""
-    identity = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
-    done = subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True)
-    return done.stdout.strip()
-
-
-def test_commit_is_head_and_detects_untracked_files(tmp_path):
-    _git(tmp_path, "init")
-    (tmp_path / "package").mkdir()
-    (tmp_path / "package" / "file").write_text("1")
-    _git(tmp_path, "add", ".")
-    _git(tmp_path, "commit", "-m", "Begin")
-    head = _git(tmp_path, "rev-parse", "HEAD")
-    assert runtime.git_commit(tmp_path / "package") == (head, False)
-    (tmp_path / "beside").write_text("2")
-    assert runtime.git_commit(tmp_path / "package") == (head, True)

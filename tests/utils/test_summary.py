@@ -43,19 +43,6 @@ def test_summary_has_main_metrics_in_words_with_units_beside_the_papers_values(s
     assert lines[6] == ["steps", "12,346", "1/s"]
 
 
-def test_summary_lists_picture_film_recording_and_metrics_but_no_other_files(summary):
-    text, folder = summary()
-    for kind, name in (
-        ("picture", "a.png"),
-        ("film", "film.mp4"),
-        ("recording", "jump.rrd"),
-        ("metrics", "metrics.json"),
-    ):
-        assert f"{kind:9}  {folder / name}\n" in text
-    assert "notes.txt" not in text and "--verbose prints 6 metrics" in text
-    assert text.count("\n") <= 24
-
-
 def test_json_prints_the_file_and_nothing_else(summary):
     text, folder = summary(json=True)
     assert json.loads(text) == json.loads((folder / "metrics.json").read_text())

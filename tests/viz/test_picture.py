@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
-from columns import XY, X, Y, Z
+from box_robot import GREEN, RATE, STANDING, box_recording, pinhole, walk
+from columns import XY, X, Z
 from jumper_warp.viz import picture
 from jumper_warp.viz.picture import GAP, MOST, SIDE_BY_SIDE, SPREAD, compose, write_picture
 
@@ -59,15 +58,6 @@ def test_horizontal_jump_keeps_its_places_and_runs_to_the_right(heading):
     assert distance[~np.eye(len(distance), dtype=bool)].min() >= GAP - 1e-6  # [m]
 
 
-@pytest.mark.parametrize(("distance", "heading", "shown"), [(0.3, 1.5, 1.5), (0.1, 1.5, 0.0), (0.3, 3.0, 3.0)])
-def test_short_jump_is_spread_in_its_direction_and_a_drift_is_not(distance, heading, shown):
-    positions, forces = jump(distance)
-    turned = np.array([[np.cos(heading), np.sin(heading), 0.0], [-np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
-    scene = compose(box_recording(positions @ turned, forces=forces))
-    assert scene.right == pytest.approx([np.cos(shown), np.sin(shown), 0.0], abs=1e-6)
-    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
-
-
 def test_each_of_two_jumps_in_a_row_has_its_apex():
     positions, forces = jump(1.0)
     later = positions + [1.0, 0.0, 0.0]
@@ -77,34 +67,6 @@ def test_each_of_two_jumps_in_a_row_has_its_apex():
     second = REST + 1
     assert scene.flights == [(TAKEOFF, TOUCHDOWN), (second + TAKEOFF, second + TOUCHDOWN)]
     assert {APEX, second + APEX} <= set(scene.frames)
-
-
-@pytest.mark.parametrize("drift", [0.0, 0.1])  # [m] a hop
-def test_hops_in_place_show_the_first_and_then_apexes_over_time_without_their_path(drift):
-    positions, forces = jump(drift)
-    hops = np.concatenate([positions + [drift * i, 0.0, 0.0] for i in range(8)])
-    scene = compose(box_recording(hops, forces=np.tile(forces, 8)))
-    hop = REST + 1
-    assert list(scene.frames[:3]) == [TAKEOFF, APEX, TOUCHDOWN] and len(scene.frames) == MOST
-    assert [(frame - APEX) / hop for frame in scene.frames[3:-1]] == [1, 4, 7]
-    assert scene.frames[-1] == 8 * hop - 1
-    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
-    axis, *_ = (line.points for line in picture._lines(scene))
-    assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, Z] == pytest.approx(scene.lowest)
-    assert all(len(line.points) == 2 for line in picture._lines(scene))  # no arrow: moments are not to scale
-    assert "time, not\nto scale" in [label.text for label in picture._labels(scene)]
-    times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
-    assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
-    assert all(label.point[Z] < scene.lowest for label in times)
-
-
-@pytest.mark.parametrize("distance", [0.0, 1.5])
-def test_front_view_shows_the_robots_side_by_side(distance):
-    scene = compose(jump_recording(distance), eye=(3.0, 0.0, 0.5))
-    assert scene.right == pytest.approx([0.0, 1.0, 0.0]) and scene.toward_eye == pytest.approx([1.0, 0.0, 0.0])
-    assert np.diff(scene.bases[:, Y]) == pytest.approx(SPREAD) and len(scene.frames) == 7
-    axis, *_ = (line.points for line in picture._lines(scene))
-    assert axis[:, X].min() > scene.bases[:, X].max()  # in front of all robots
 
 
 def test_lifted_paws_without_rise_are_no_jump():
@@ -151,25 +113,3 @@ def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_pat
     assert (pixels > 0.0).all() and (pixels < size).all()
     assert (np.diff(pixels[:-1, 0]) > 0.0).all()  # from left to right
     assert list(compose(recording, 1).heights) == [pytest.approx(0.9)]
-
-
-@pytest.mark.parametrize("value", [np.nan, 1.0e9])
-@pytest.mark.parametrize(("distance", "first"), [(0.0, TAKEOFF + 5), (1.5, TOUCHDOWN + 3)])
-def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
-    recording = jump_recording(distance)
-    for values in (recording.poses, recording.contact_points, recording.contact_forces):
-        values[first:] = value
-    assert compose(recording).frames.max() < first
-    with Image.open(write_picture(recording, tmp_path / "lost.png", width=WIDTH)) as image:
-        assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-@pytest.mark.parametrize(("eye", "toward"), [(None, (0.0, -1.0)), ((4.0, 3.0, 1.0), (0.8, 0.6))])
-def test_eye_is_on_the_right_of_the_path_or_in_a_direction(tmp_path, monkeypatch, eye, toward):
-    views = []
-    framed = picture._framed
-    monkeypatch.setattr(picture, "_framed", lambda *args: views.append(framed(*args)) or views[-1])
-    write_picture(jump_recording(1.5), tmp_path / "jump.png", width=WIDTH, eye=eye)
-    ((view, _),) = views
-    aside = (view.eye - view.target)[:2]
-    assert aside / np.linalg.norm(aside) == pytest.approx(toward, abs=1e-6)

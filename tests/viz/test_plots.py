@@ -62,16 +62,3 @@ def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     low, high = np.ptp(band[np.isclose(band[:, 0], middle), 1]), 2 * 1.96 * 0.1 / np.sqrt(plots.WINDOW[1])
     plt.close()
     assert low == pytest.approx(high, rel=0.3)
-
-
-def test_landings_show_outline_of_a_platform_and_failures(drawn):
-    goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])  # [m]; the second jump fails
-    corners = np.array([[(-1.0, -1.0), (0.4, -1.0), (0.4, 1.0), (-1.0, 1.0)]])
-    (axis,) = drawn(
-        plots.plot_landings, {"platform": (goals, goals + 0.2, good)}, tolerance=0.1, title="", conditions="",
-        outlines={"platform": ("platform, 0.15 m high", corners)},
-    )  # fmt: skip
-    assert axis.get_title(loc="left") == "platform, 0.15 m high" and axis.get_aspect() == 1.0
-    np.testing.assert_allclose(axis.collections[0].get_paths()[0].vertices[:4], corners[0])
-    failed = next(marks for marks in axis.collections if marks.get_label() == "failed")
-    np.testing.assert_allclose(failed.get_offsets(), [(1.4, 0.3)])  # its landing, 0.2 m off along x and y

@@ -87,11 +87,3 @@ def test_heightfield_has_its_heights_at_its_nodes_facing_up():
     assert {tuple(np.round(vertex, 5).tolist()) for vertex in mesh.vertices} == expected
     assert len(mesh.triangles) == 4  # two for each of two cells
     assert (mesh.normals[:, 2] > 0.0).all()
-
-
-def test_hidden_shapes_and_other_worlds_are_left_out():
-    def add(builder, body):  # a visible and a hidden box
-        builder.add_shape_box(body, label="seen")
-        builder.add_shape_box(body, label="hidden", cfg=newton.ModelBuilder.ShapeConfig(is_visible=False))
-
-    assert [mesh.name for mesh in build(add)] == ["seen"]
