@@ -96,20 +96,9 @@ def test_checks_of_gymnasium_pass():
 def test_step_results_are_copies(tensors):
     envs = GymVectorEnv(jumper(), tensors=tensors)
     actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
-    obs, infos = envs.reset(seed=2)
-    results = [obs]
-    for action in actions[:13]:
-        *values, step_infos = envs.step(action)
-        results += values
-        infos = step_infos or infos
-    results += [
-        infos["_final_obs"],
-        infos["_final_info"],
-        infos["final_info"]["termination"],
-        infos["final_info"]["_termination"],
-    ]
-    results += infos["final_info"]["episode"].values()
-    results += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
+    results = [envs.reset(seed=2)[0]]
+    for *values, infos in played(envs, actions[:13]):
+        results += [*values, *(infos[name] for name in ("_final_obs", "_final_info") if name in infos)]
     copies = [value.clone() if tensors else value.copy() for value in results]
     played(envs, actions[13:])
     for value, copy in zip(results, copies, strict=True):

@@ -163,6 +163,17 @@ def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(lan
 # ---------------------------------------------------------------- the configuration
 
 
+def test_ground_settings_reach_the_kernel_struct_by_name():
+    cfg = GroundCfg(
+        platform=0.25, block=0.5, drop=(0.125, 0.25), rise=(0.0625, 0.5), room=0.75, clearance=0.375,
+        mass=(2.0, 4.0), friction=(0.5, 0.625),
+    )  # fmt: skip
+    ranges = cfg.ranges()
+    assert (ranges.platform, ranges.block, ranges.room, ranges.clearance) == (0.25, 0.5, 0.75, 0.375)
+    pairs = (ranges.drop, ranges.rise, ranges.mass, ranges.friction)
+    assert [tuple(pair) for pair in pairs] == [(0.125, 0.25), (0.0625, 0.5), (2.0, 4.0), (0.5, 0.625)]
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -176,14 +187,3 @@ def test_refuses_invalid_ground_settings(values, message):
     with pytest.raises(ValueError, match=message) as caught:
         GroundCfg(**values)
     assert "\n" not in str(caught.value)
-
-
-def test_ground_settings_reach_the_kernel_struct_by_name():
-    cfg = GroundCfg(
-        platform=0.25, block=0.5, drop=(0.125, 0.25), rise=(0.0625, 0.5), room=0.75, clearance=0.375,
-        mass=(2.0, 4.0), friction=(0.5, 0.625),
-    )  # fmt: skip
-    ranges = cfg.ranges()
-    assert (ranges.platform, ranges.block, ranges.room, ranges.clearance) == (0.25, 0.5, 0.75, 0.375)
-    pairs = (ranges.drop, ranges.rise, ranges.mass, ranges.friction)
-    assert [tuple(pair) for pair in pairs] == [(0.125, 0.25), (0.0625, 0.5), (2.0, 4.0), (0.5, 0.625)]

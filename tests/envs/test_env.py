@@ -21,7 +21,6 @@ from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import RewardTerm
 
 TASK = make_task("vertical-jump")
@@ -305,10 +304,3 @@ def test_standing_has_the_same_pose_and_reward_on_both_solvers():
 def test_refuses_invalid_configurations(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_the_saved_configuration_names_the_terms_functions(env):
-    config = env.config()
-    assert isinstance(env.task, TaskCfg) and config["task"]["rewards"][0]["func"].endswith(":jump_height")
-    assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0)
-    assert len(config["interface"]["observation_names"]) == env.num_obs == 147

@@ -4,14 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-import tyro
 
 from columns import XY, Z
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts
-from jumper_warp.cli.train import parse_train
-from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.sim.simulation import Simulation
@@ -59,11 +55,3 @@ def test_starts_in_flight_come_down_at_their_goal_on_mars():
     np.testing.assert_allclose(place[far], found.goal[far, :2], atol=2e-3)
     slope = np.arctan2(found.vel[:, Z], np.linalg.norm(found.vel[:, XY], axis=1)) / DEG
     assert slope.max() < 45.0
-
-
-def test_gravity_is_a_flag_of_trainings_evaluations_and_experiments():
-    assert parse_train(["vertical-jump", "--env.gravity", "3.71"])[1].gravity == MARS
-    assert tyro.cli(Conditions, args=["--gravity", "3.71"]).gravity == MARS
-    assert conditions_of(tyro.cli(EvaluationArgs, args=["--gravity", "3.71"])).gravity == MARS
-    assert Conditions(gravity=MARS).applied(make_task("velocity-flat")).gravity == MARS
-    assert Conditions().applied(VERTICAL).gravity == MARS

@@ -1,11 +1,9 @@
 """Images and videos of Gymnasium environments."""
 
 import gymnasium
-import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers.vector import RecordVideo
 from scipy.interpolate import RegularGridInterpolator
 
 from columns import XY
@@ -26,12 +24,6 @@ def vector(task="vertical-jump", num_envs=2, **arguments):
     return gymnasium.make_vec(env_id(task), num_envs=num_envs, **options)
 
 
-def middle(image):
-    """Return the middle third of an image."""
-    height, width = image.shape[:2]
-    return image[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3]
-
-
 def brown(image):
     """Return the number of pixels in the color of blocks."""
     red, green, blue = image.astype(int).transpose(2, 0, 1)
@@ -39,24 +31,6 @@ def brown(image):
 
 
 # ---------------------------------------------------------------- videos
-
-
-@pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step:UserWarning")
-def test_record_video_writes_a_film_of_all_robots(tmp_path):
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
-    envs = RecordVideo(vector(), str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
-    envs.reset(seed=1)
-    for action in ACTIONS:
-        envs.step(action)
-    envs.close()
-    reader = imageio_ffmpeg.read_frames(str(tmp_path / "videos" / "rl-video-episode-0.mp4"))
-    facts = next(reader)
-    frames = [np.frombuffer(frame, np.uint8).reshape(SIZE[1], 2 * SIZE[0], 3) for frame in reader]
-    assert (facts["size"], facts["fps"], len(frames)) == ((2 * SIZE[0], SIZE[1]), 60.0, len(ACTIONS) + 1)
-    for column in (slice(0, SIZE[0]), slice(SIZE[0], None)):
-        robot = [middle(frame[:, column]).astype(float) for frame in frames]
-        assert min(image.std() for image in robot) > 30.0
-        assert np.abs(robot[-1] - robot[0]).mean() > 3.0
 
 
 # ---------------------------------------------------------------- images
@@ -110,6 +84,3 @@ def test_drawn_heightfield_equals_the_simulated_one(point):
     np.testing.assert_allclose(vertices[inside, 2], expected, atol=1.0e-4)
     assert inside.sum() > 1000 and np.ptp(vertices[inside, 2]) > 0.05
     assert np.isfinite(vertices).all() and np.abs(vertices[:, XY] - point).max() == pytest.approx(5.0, abs=0.1)
-
-
-# ---------------------------------------------------------------- refusals

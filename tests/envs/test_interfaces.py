@@ -15,7 +15,7 @@ from jumper_warp.registry import make_task
 N = 8
 TASK = make_task("vertical-jump")
 REST = torch.zeros((N, 12))
-NAN, INF = math.nan, math.inf
+NAN = math.nan
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """CPU threads: results do not depend on their number bitwise, and errors reach the caller."""
 
 import dataclasses
-import os
 import threading
 import time
 from functools import partial
@@ -26,7 +25,6 @@ from jumper_warp.sim.slices import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
-from jumper_warp.utils.errors import InputError
 from skill_helpers import begin_hold, begin_jump, jump_requested
 
 N = 3 * MIN_WORLDS + 2
@@ -168,12 +166,6 @@ def test_slices_contain_each_world_once_and_are_about_equal(worlds, threads):
     assert worlds >= 2 * MIN_WORLDS or slices == [WorldRange(0, worlds)]
 
 
-def test_mujoco_has_one_slice():
-    assert Simulation(2 * MIN_WORLDS, solver="mujoco", visuals=False, device="cpu", threads=2).slices == [
-        (0, 2 * MIN_WORLDS)
-    ]
-
-
 # ---------------------------------------------------------------- threads
 
 
@@ -204,21 +196,3 @@ def test_the_exception_of_a_job_is_raised_after_all_started_jobs_have_ended(fail
     assert ended == [True]
     pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads still run
     assert len(ended) == 3
-
-
-def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)))
-    assert pool.checked_threads(None) == 6
-    for processes, threads in (("2", 3), ("4", 1), ("16", 1)):
-        monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
-        assert pool.checked_threads(None) == threads
-    pool.set_threads(5)
-    assert pool.checked_threads(None) == 5 and pool.checked_threads(2) == 2
-
-
-@pytest.mark.parametrize("threads", [0, 1.5])
-def test_refuses_an_invalid_number_of_threads(threads):
-    message = "threads must be a whole number of 1 to 1024, got"
-    for use in (pool.set_threads, lambda n: TrainCfg(threads=n), lambda n: Simulation(1, device="cpu", threads=n)):
-        with pytest.raises(InputError, match=message):
-            use(threads)

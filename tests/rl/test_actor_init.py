@@ -2,18 +2,14 @@
 
 import dataclasses
 import itertools
-import json
 
 import pytest
 import torch
-from test_shac import SmoothPushTask
-from test_train import final_state, make_env
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.mirror import contract_layers, expand_layers, nearest_expanded_layers, symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, push_cfg
 
@@ -66,21 +62,6 @@ def test_contract_inverts_expand_of_symmetric_layers(hidden):
         torch.testing.assert_close(result, layer, atol=0.0, rtol=0.0)
 
 
-def changed(layers, index, part):
-    """Return a copy of the layers with 0.01 added to the last entry of a weight (part 0) or bias (part 1)."""
-    layers = [tuple(tensor.clone() for tensor in layer) for layer in layers]
-    layers[index][part].view(-1)[-1] += 0.01
-    return layers
-
-
-@pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("part", [0, 1], ids=["weight", "bias"])
-def test_contract_refuses_layers_that_are_not_symmetric(index, part):
-    layers = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
-    with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        contract_layers(changed(layers, index, part), SYMMETRY)
-
-
 @pytest.mark.parametrize("hidden", [(16,), (32, 24), (8, 6, 4)])
 def test_nearest_expanded_layers_is_an_orthogonal_projection(hidden):
     exact = expand_layers(layers_of(actor(hidden, SYMMETRY)), SYMMETRY)
@@ -121,19 +102,6 @@ def test_initialised_actor_acts_as_the_policy(policy_symmetry, symmetry, hidden)
     ppo.env.reset()
     ppo.collect()  # uses the new weights, although the collector was built with the old ones
     torch.testing.assert_close(ppo.rollout.mean[0].clamp(-1.0, 1.0), model.act(ppo.rollout.obs[0]), atol=1e-5, rtol=0.0)
-
-
-@pytest.mark.parametrize(
-    ("symmetric", "change", "message"),
-    [
-        (False, {"hidden": (16, 8)}, "has hidden layers 32, 32, the settings 16, 8: pass --ppo.hidden 32 32"),
-        (True, {"symmetry": "actor", "hidden": (9,)}, "layers 64, 64, the settings 18: pass --ppo.hidden 32 32"),
-    ],
-)
-def test_refuses_settings_of_another_network_in_one_line(symmetric, change, message):
-    with pytest.raises(InputError, match=f"init_policy: the policy .*{message}") as caught:
-        actor_init_of(actor(symmetry=SYMMETRY if symmetric else None), dataclasses.replace(SMALL, **change))
-    assert "\n" not in str(caught.value)
 
 
 def averaged(act, obs):
@@ -177,28 +145,3 @@ def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
 
 
 # ---------------------------------------------------------------- trainings
-
-
-@pytest.mark.parametrize(("trainer", "env"), [("ppo", make_env), ("shac", SmoothPushTask)])
-def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys, trainer, env):
-    cfg = dataclasses.replace(cfg, trainer=trainer, shac=dataclasses.replace(cfg.shac, lr=1e-9))
-    model = actor()
-    result = train(cfg, env, actor_init=actor_init_of(model))
-    model_state, stderr = final_state(result)["ppo"]["model"], capsys.readouterr().err.splitlines()
-    assert stderr[1] == "starts from pusher"
-    torch.testing.assert_close(model_state["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)
-    torch.testing.assert_close(model_state["log_std"], torch.zeros(1), atol=1e-6, rtol=0.0)
-    samples = 32 * SMALL.num_steps  # of 32 worlds
-    assert model_state["obs_moments.count"] == (PRIOR_ITERATIONS + 1) * samples
-    assert 0.0 < (model_state["obs_moments.mean"] - model.obs_moments.mean).abs().max() < 0.05
-    assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
-
-
-def test_resume_uses_the_checkpoint_and_keeps_the_initial_policys_name(cfg, capsys):
-    first = train(cfg, make_env, actor_init=actor_init_of(actor()))
-    capsys.readouterr()
-    resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2)
-    second = train(resumed, make_env)
-    assert "starts from" not in capsys.readouterr().err
-    assert final_state(second)["ppo"]["model"]["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
-    assert json.loads((second.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"

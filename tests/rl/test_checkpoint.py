@@ -1,4 +1,3 @@
-import json
 import os
 import pickle
 
@@ -13,7 +12,6 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from jumper_warp.utils.files import write_atomically
 
 
 def state(iteration):
@@ -104,27 +102,3 @@ def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     path, loaded, skipped, _ = latest_checkpoint(tmp_path)
     assert (path, loaded["iteration"]) == (paths[0], 1)
     assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
-
-
-def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    write_atomically(path, b"old")
-
-    def full_disk(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left") as caught:
-        write_atomically(path, b"new")
-    assert caught.value.filename == str(path)  # run_command prints errors with a file name in one line
-    assert path.read_bytes() == b"old"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
-
-
-def test_latest_checkpoint_ignores_files_missing_from_the_manifest(tmp_path):
-    first = save_checkpoint(tmp_path, state(1))
-    manifest = (tmp_path / MANIFEST).read_text()
-    save_checkpoint(tmp_path, state(2))
-    (tmp_path / MANIFEST).write_text(manifest)  # as after an interruption between the two writes
-    assert latest_checkpoint(tmp_path)[0] == first
-    assert json.loads(manifest).keys() == {first.name}

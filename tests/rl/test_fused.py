@@ -85,19 +85,6 @@ def test_two_ranks_with_different_worlds_have_the_same_parameters(tmp_path):
 # ---------------------------------------------------------------- without Triton
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"hidden": (16, 9)}, "they need hidden widths that are multiples of 16, got 16, 9"),
-        ({"activation": "tanh"}, "they need the activation elu, got tanh"),
-    ],
-)
-def test_other_networks_use_pytorch_and_print_a_line(change, reason, capsys, monkeypatch):
-    monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert type(make_ppo(PushTask(4), dataclasses.replace(FUSED, **change))) is Ppo
-    assert capsys.readouterr().err == f"PPO trains with PyTorch, more slowly than with fused kernels: {reason}\n"
-
-
 def test_cpu_and_no_fused_use_pytorch_silently(capsys, monkeypatch):
     assert type(make_ppo(PushTask(4), FUSED)) is Ppo
     monkeypatch.setenv("TRITON_INTERPRET", "1")

@@ -1,7 +1,5 @@
-import contextlib
 import dataclasses
 import json
-import resource
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -20,17 +18,6 @@ def cfg(tmp_path):
     return push_cfg(tmp_path / "logs", max_iterations=6, log_interval=1)
 
 
-@contextlib.contextmanager
-def full_disk(size=0):
-    """Context in which this process cannot write files beyond `size` bytes: writes fail partway."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def iterations(path):
     """Return the iteration of each line of a metrics file."""
     return [json.loads(line)["iteration"] for line in path.read_text().splitlines()]
@@ -41,39 +28,6 @@ def event_steps(folder):
     events = EventAccumulator(str(folder))
     events.Reload()
     return [event.step for event in events.Scalars("Loss/value")]
-
-
-class DiskFillingTask(PushTask):
-    """Task that makes the disk full while the metrics of the second and third iteration are logged."""
-
-    stack: contextlib.ExitStack  # holds `full_disk` while it applies
-
-    def metrics(self):
-        """Return the metrics; at the end of the second iteration the disk becomes full."""
-        if self.steps == 2 * 16:
-            self.stack.enter_context(full_disk())
-        return super().metrics()
-
-    def step(self, action):
-        """Step the task; in the fourth iteration the disk has room again."""
-        super().step(action)
-        if self.steps == 3 * 16 + 1:
-            self.stack.close()
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # in SummaryWriter's thread
-@pytest.mark.parametrize("tensorboard", [False, True])
-def test_temporarily_full_disk_loses_no_metrics_and_warns_once(cfg, capsys, tensorboard):
-    cfg = dataclasses.replace(cfg, tensorboard=tensorboard)
-    with contextlib.ExitStack() as DiskFillingTask.stack:
-        result = train(cfg, DiskFillingTask)
-    assert iterations(result.folder / METRICS_FILE) == [1, 2, 3, 4, 5, 6]
-    assert (result.folder / CHECKPOINTS / "iteration_000006.pt").exists()
-    stderr = capsys.readouterr().err.splitlines()
-    assert ["training continues" in line for line in stderr].count(True) == 1
-    assert ["no TensorBoard events" in line for line in stderr].count(True) == int(tensorboard)
-    if tensorboard:
-        assert event_steps(result.folder) == [1]
 
 
 def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
