@@ -4,9 +4,9 @@ import dataclasses
 import time
 
 import pytest
-from test_train import final_state
 
 from jumper_warp.rl.runner import train
+from test_train import final_state
 from toy_task import SMALL, PushTask, push_cfg
 
 
