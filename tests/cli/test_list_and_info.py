@@ -1,13 +1,10 @@
 """`jumper list` and `jumper info` against the files in the policies' folders and the tasks themselves."""
 
 import json
-import shutil
 
 import pytest
 
 from cli_helpers import run
-from jumper_warp.cli.info import results_table
-from jumper_warp.policies.catalog import summarise
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
 
@@ -72,15 +69,6 @@ def test_info_of_a_policy_fits_a_screen_and_has_its_metrics(capsys, name):
     assert json.loads(run(capsys, "info", name, "--json")[1])["rows"][0]["metrics"] == metrics
 
 
-def test_table_of_a_policy_has_the_first_seed_of_each_condition():
-    def row(condition, seed, rate):
-        metric = {"value": rate, "unit": None, "trials": 10}
-        return {"condition": condition, "seed": seed, "conditions": {}, "metrics": {"success_rate": metric}}
-
-    rows = [row("nominal", 0, 0.5), row("nominal", 1, 0.6), row("gains_0.6", 0, None), row("gains_0.6", 1, 0.8)]
-    assert results_table(rows) == ["condition  success", "nominal     50.0 %", "gains 0.6         ", "10 trials a line"]
-
-
 @pytest.mark.parametrize("name", ["vertical-jump", "velocity_trot", "Olympus-Walk", "attitude"])
 def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
     task, flag = make_task(name), ["--task"] if name == "attitude" else []
@@ -91,28 +79,3 @@ def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
     assert content["rewards"] == {term.name: term.numbers["weight"] for term in task.rewards}
     assert content["terminations"] == [term.name for term in task.terminations]
     assert content["observation_sizes"]["actor"] == len(task.observation_names)
-
-
-@pytest.mark.parametrize(
-    ("args", "start"),
-    [
-        (["vertical_jump"], "vertical_jump: policy for the task vertical-jump"),
-        (["vertical-jump"], "vertical-jump: jump to a height"),
-        (["vertical_jump", "--task"], "vertical-jump: jump to a height"),
-        (["mars-springs-jump"], "mars_springs_jump: policy for"),
-        (["attitude"], "attitude: policy for"),
-        (["velocity_flat"], "velocity-flat: walk"),
-    ],
-)
-def test_spelling_decides_between_a_task_and_a_policy_of_one_name(capsys, args, start):
-    assert run(capsys, "info", *args)[1].startswith(start)
-
-
-def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
-    for name in ("config.json", "policy.onnx"):
-        shutil.copy(POLICIES / "vertical_jump" / name, tmp_path / name)
-    row = json.loads((POLICIES / "vertical_jump/metrics.json").read_text())["rows"][0]
-    saved = {"schema": "jumper-warp metrics", "version": 1, "conditions": row["conditions"], "metrics": row["metrics"]}
-    (tmp_path / "metrics.json").write_text(json.dumps(saved))
-    assert summarise(tmp_path).success == row["metrics"]["success_rate"]["value"]
-    assert "as evaluated   96.7 %" in run(capsys, "info", str(tmp_path))[1]

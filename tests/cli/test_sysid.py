@@ -1,6 +1,5 @@
 """The command `jumper sysid`, from planned motions to an overlay that the other commands take."""
 
-import csv
 import json
 import re
 from dataclasses import replace
@@ -11,20 +10,10 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.identification.actuators import COLUMNS, described_constants
 from jumper_warp.identification.motions import load_motion
-from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from synthetic_bench import synthetic_bench
 
 PARAMS = ["--params", "latency,offsets"]
-
-
-def write_csv_table(path, motion, sign=1.0):
-    """Write times, targets and angles of a motion as a CSV table without settings; sign: factor on the angles."""
-    names = [f"{channel}/{joint}" for channel in ("target", "angle") for joint in MOTOR_JOINTS]
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows(
-            [["time", *names], *np.column_stack([motion.time, motion.target, sign * motion.angle]).tolist()]
-        )
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +63,6 @@ def test_prints_warning_of_a_wrong_mass(recorded, capsys):
         main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
     assert end.value.code == 3
     assert "warning: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
-
-
-def test_prints_warning_of_a_hung_robot_taken_as_free(recorded, capsys):
-    write_csv_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
-    with pytest.raises(SystemExit) as end:
-        main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
-    assert end.value.code == 3
-    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
-    assert len(warnings) == 1 and "hung fits worst" in warnings[0] and "--base fixed" in warnings[0]
-    assert "--base fixed" in (recorded / "as_free" / "report.html").read_text()
 
 
 def test_inconsistent_fit_exits_with_3_and_renames_the_overlay(recorded, capsys):

@@ -10,15 +10,11 @@ import pytest
 
 from cli_helpers import run
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.main import split_task_modules
-from jumper_warp.cli.train import check_saving, command_line
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import load_policy, open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, load_task_module, make_task
-from jumper_warp.rl.checkpoint import save_checkpoint
-from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
 
 LEVEL_JUMP = Path(__file__).parents[1] / "helpers" / "level_jump.py"
 TASK = '''\
@@ -126,32 +122,11 @@ def play(source, *args):
     return ["play", str(source), "--height", "0.6", "--seconds", "0.1", "--device", "cpu", *args]
 
 
-def test_task_modules_are_split_from_other_arguments():
-    args = ["a", "--task-module", "x.py", "--b", "--task-module=pack.age", "--task_module", "y.py", "c"]
-    assert split_task_modules(args) == (["a", "--b", "c"], ["x.py", "pack.age", "y.py"])
-
-
 def test_list_shows_tasks_of_a_module_and_policies(capsys, path):
     code, out, _ = run(capsys, "list", f"--task-module={path}")
     lines = [" ".join(line.split()) for line in out.splitlines()]
     assert code == 0 and any(line.startswith("tame-jump ") for line in lines)
     assert "vertical-jump jump to a height vertical_jump" in lines
-
-
-def test_functions_of_a_neighbour_are_saved_and_found_again(capsys, tmp_path):
-    (tmp_path / "my_jumps.py").write_text(
-        TASK.replace("@wp.func\ndef too_high", "from my_ends import too_high\n\n\ndef unused")
-    )
-    end = TASK[TASK.index("@wp.func\ndef too_high") : TASK.index("def tame_jump")]
-    (tmp_path / "my_ends.py").write_text(TASK[: TASK.index("@wp.func")] + end)
-    sys.modules.pop("my_ends", None)
-    before = list(sys.path)
-    module = load_task_module(str(tmp_path / "my_jumps.py"))
-    saved = task_to_json(make_task("low-jump"))
-    assert saved["terminations"][-1]["func"] == "my_ends:too_high" and sys.path == before
-    assert task_from_json(saved, [module]) == make_task("low-jump")
-    with pytest.raises(TaskError, match="needs 'my_ends:too_high'"):
-        task_from_json(saved | {"rewards": [], "events": [], "observations": saved["observations"] | {"critic": []}})
 
 
 def test_training_saves_functions_by_module_and_name(runs):
@@ -193,14 +168,6 @@ def test_restored_task_uses_the_users_reward_function(runs, path):
     assert task == make_task("tame-jump").with_terms("rewards", base_at_rest={"height": 0.4})
 
 
-def test_saved_command_line_includes_task_modules(path):
-    import json.decoder as module
-
-    args = ["tame-jump", "--seed", "3", "--resume", "latest", "--resume=x"]
-    expected = f"jumper train tame-jump --seed 3 --task-module {path} --task-module json.decoder"
-    assert command_line(args, [load_task_module(path), module]) == expected
-
-
 def test_resume_restores_the_users_task(capsys, runs, path, tmp_path):
     folder = tmp_path / "tame-jump" / "run"
     shutil.copytree(runs["tame-jump"], folder)
@@ -227,25 +194,6 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4
-
-
-def test_registered_tasks_can_be_saved():
-    for name in TASKS:
-        check_saving(make_task(name))
-    with pytest.raises(TaskError):
-        check_saving(make_task("vertical-jump").with_terms("rewards", base_at_rest={"name": "a:b"}))
-
-
-@pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])
-@pytest.mark.parametrize("command", ["train", "export"])
-def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
-    config = {"train": {"task": "vertical-jump", "ppo": {}}, "env": {"task": task}}
-    state = {"iteration": 7, "ppo": {}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
-    save_checkpoint(tmp_path / "run" / "checkpoints", state)
-    source = ["vertical-jump", "--resume"] if command == "train" else []
-    code, out, err = run(capsys, command, *source, str(tmp_path / "run"))
-    assert (code, out) == (2, "") and len(err) == 1
-    assert f"the task has version {task.get('version')}, expected version 4; commit 05fa856 reads version 3" in err[0]
 
 
 @pytest.mark.parametrize(
