@@ -80,14 +80,6 @@ def test_next_step_ignores_the_action_after_an_end_and_returns_a_first_observati
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_every_mode_counts_an_episode_once(mode):
-    envs = vector(mode)
-    envs.reset()
-    ends = sum(int((terminated | truncated).sum()) for _, _, terminated, truncated, _ in play(envs))
-    assert envs.env.skills[0].counters.termination_count.numpy().sum() == ends > N
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_episodes_have_the_same_length_in_every_mode(mode):
     task = TASK.with_terms("terminations", tilted={"angle": 3.0})
     envs = wrappers.RecordEpisodeStatistics(vector(mode, task))
@@ -197,10 +189,3 @@ def test_end_of_an_episode_is_explained():
         env.step(ACTIONS[0, 0])
     env.reset()
     env.step(ACTIONS[0, 0])
-
-
-def test_gymnasiums_own_vector_environment_works_on_it():
-    envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, vectorization_mode="sync", device="cpu")
-    assert envs.reset(seed=1)[0] in envs.observation_space
-    assert envs.step(np.zeros((2, 12), dtype=np.float32))[0] in envs.observation_space
-    envs.close()

@@ -12,14 +12,13 @@ from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
 from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
-from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters, total_mass, weighed_mass
+from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import standing_configuration
-from jumper_warp.utils.errors import InputError
 
 DEGREE = math.pi / 180.0  # [rad]
 
@@ -209,23 +208,6 @@ def test_open_directions_report_that_masses_and_gains_share_a_scale():
     information = scorer.information(plan, scorer.record(plan))
     lines = [direction.words for direction in weak_directions(parameters, information)]
     assert any("share a scale: add a weighed mass" in line for line in lines), lines
-
-
-def test_parameters_refuse_bad_priors_names_and_groups():
-    good = dict(name="a", quantity="kp", places=(0,), unit="1", nominal=1.0, prior=0.1, bounds=(0.5, 2.0))
-    Parameter(**good)
-    for change in ({"bounds": (2.0, 3.0)}, {"prior": 0.0}, {"bounds": (-1.0, 2.0)}, {"bounds": (0.5, math.nan)}):
-        with pytest.raises(InputError, match="parameter a"):
-            Parameter(**(good | change))
-    with pytest.raises(InputError, match="name of its own"):
-        ParameterSet((Parameter(**good), Parameter(**good)))
-    with pytest.raises(InputError, match="unknown group of parameters 'gears'"):
-        jumper_parameters(["gears"])
-
-
-def test_identify_refuses_no_motions():
-    with pytest.raises(InputError, match="at least one motion"):
-        identify([], jumper_parameters())
 
 
 def test_normalised_inverts_values():
