@@ -1,14 +1,12 @@
-"""Measure the shipped policies in all conditions and tests, and write their metrics.json and the tables in docs/.
+"""Measure the shipped policies in all conditions and tests, and write their metrics.json.
 
     python experiments/measure_policies.py --out outputs/policies
     python experiments/measure_policies.py --out outputs/policies --save-to-policies
-    python experiments/measure_policies.py --write-tables
 
 The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row), and runs the
-further tests (`support/policy_tests.py`) with the first seed. It writes `OUT/POLICY/CONDITION-SEED/metrics.json` after
-each row, and skips existing rows. Work can be interrupted, split by --policies and --conditions, and shared by
-processes. The second command saves these rows in the policies' folders. The third one makes the tables in docs/ and the
-policies' pages from the saved rows. Only the first one simulates.
+further tests (`policy_pages.toml`) with the first seed. It writes `OUT/POLICY/CONDITION-SEED/metrics.json` after each
+row, and skips existing rows. Work can be interrupted, split by --policies and --conditions, and shared by processes.
+The second command saves these rows in the policies' folders. `policy_tables.py` makes the tables in docs/ from them.
 """
 
 from __future__ import annotations
@@ -16,28 +14,93 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
-import time
-from dataclasses import dataclass
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import tyro
 
+from jumper_warp.evaluation.attitude import AttitudeFlags
 from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 from jumper_warp.evaluation.evaluations import default_flags
+from jumper_warp.evaluation.jump_metrics import JumpFlags
 from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
 from jumper_warp.policies.conditions import Conditions
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
-from support.policy_conditions import CONDITIONS, commands_of, payload_overlay, undefined, with_trials
-from support.policy_page import pages, write_pages
-from support.policy_results import METRICS, read_rows, save_to_policies, tasks_of
-from support.policy_tests import COMBINED, TESTS, run_test
-from support.scripts import ThreadArgs, run_script
+from support.policy_results import (
+    COMBINED,
+    CONDITIONS,
+    METRICS,
+    TESTS,
+    read_rows,
+    save_to_policies,
+    tasks_of,
+    undefined,
+)
+from support.scripts import ThreadArgs, announce, run_script, tracked
 
-PROGRESS = ("success_rate", "settled_without_collision_rate", "fall_rate")  # Metrics in the lines of progress
+
+def with_trials(flags: Any, trials: int) -> Any:
+    """Return a copy of the flags of `jumper evaluate` with at least this number of trials."""
+    if isinstance(flags, JumpFlags):
+        return replace(flags, num_jumps=trials)
+    if isinstance(flags, AttitudeFlags):
+        return replace(flags, num_turns=trials)
+    assert isinstance(flags, VelocityFlags)
+    per_axis = next(n for n in range(2, trials) if 2 * n**3 + STANDING >= trials)
+    return replace(flags, commands_per_axis=per_axis)
+
+
+def commands_of(flags: Any) -> str:
+    """Return the ranges of an evaluation's goals or velocity commands as text; flags: of `jumper evaluate`."""
+    if isinstance(flags, AttitudeFlags):
+        return f"turns by {flags.angle:g}°"
+    if isinstance(flags, VelocityFlags):
+        return "up to ±{:g} m/s, ±{:g} m/s, ±{:g} rad/s".format(*flags.max_velocity)
+    if hasattr(flags, "height_range"):
+        return "{:g} to {:g} m".format(*flags.height_range)
+    sides = "" if flags.goal_y == (0.0, 0.0) else ", to the left {:g} to {:g} m".format(*flags.goal_y)
+    return "{:g} to {:g} m".format(*flags.goal_x) + sides
+
+
+def payload_overlay(overlay: RobotOverlay | None, mass: float) -> RobotOverlay:
+    """Return a robot overlay with a point mass [kg] added at the origin of the base's frame.
+
+    overlay: robot without payload, None: the described one. The inertia about the centre of mass stays: the part that
+    the payload adds there is below 1 %.
+    """
+    overlay = overlay or RobotOverlay({})
+    robot = overlay.robots()
+    ratio = float(robot.base_mass[0, 0]) / (float(robot.base_mass[0, 0]) + mass)
+    values = {
+        "base_mass": (float(robot.base_mass[0, 0]) + mass,),
+        "base_com": tuple(float(x) for x in ratio * np.asarray(robot.base_com[0])),
+        "base_inertia": (ratio * float(robot.base_inertia[0, 0]),),
+    }
+    return RobotOverlay({**overlay.values, **values}, overlay.randomization, f"payload of {mass:g} kg")
+
+
+def run_test(policy: str, name: str, out: Path, flags: list[str]) -> None:
+    """Run the command of a test for a policy, which writes `out`/metrics.json; flags: added to the command.
+
+    Raises subprocess.CalledProcessError: the command failed; its errors are on standard error.
+    """
+    program, *args = shlex.split(TESTS[name]["command"].format(policy=policy))
+    start = ["-m", "jumper_warp"] if program == "jumper" else [program]
+    command = [sys.executable, *start, *args, *flags, "--out", str(out)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+SHOWN = ("success_rate", "settled_without_collision_rate", "fall_rate")  # Metrics in the lines of progress
 
 
 @dataclass(frozen=True)
@@ -50,8 +113,6 @@ class Args(ThreadArgs):
     conditions: tuple[str, ...] = (*CONDITIONS, *TESTS)  # Names of the conditions and further tests
     seeds: tuple[int, ...] = (0, 1)  # Seeds of sampled commands, robots and noise
     trials: int = 4096  # Least number of trials in a row
-    write_tables: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Make the tables in docs/ and the policies' pages from the saved rows; nothing is measured."""
     save_to_policies: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write the rows in `out` into metrics.json of the policies' folders; nothing is measured."""
 
@@ -78,7 +139,7 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
         for policy in args.policies
         for condition in args.conditions
         for seed in (args.seeds[:1] if condition in TESTS else args.seeds)
-        if (policy in TESTS[condition].policies if condition in TESTS
+        if (policy in TESTS[condition]["policies"] if condition in TESTS
             else policy in tasks and undefined(tasks[policy], condition) is None)
     ]  # fmt: skip
     return [row for row in defined if not (args.row(*row) / METRICS).is_file()]
@@ -90,7 +151,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
         flags = ["--seed", str(seed), *(["--device", args.device] if args.device else [])]
         run_test(policy, condition, args.row(policy, condition, seed), flags)
         return read_values(args.row(policy, condition, seed))
-    run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition].values)
+    run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition][1])
     if payload := values.pop("payload", None):
         run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,14 +164,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
 
 
 def main(args: Args) -> int:
-    """Evaluate policies in missing conditions, or save existing results to the policies, or write tables from them.
-
-    Returns the number of evaluations (rows), or of pages that changed.
-    """
-    if args.write_tables:
-        changed = write_pages(tasks_of(policy_tasks()), pages())
-        print("\n".join(map(str, changed)) or "no table changed")
-        return len(changed)
+    """Evaluate policies in missing conditions, or save existing results to the policies; return the number of rows."""
     if not args.save_to_policies:
         return measure(args)
     rows = read_rows(args.out, args.policies)
@@ -121,18 +175,17 @@ def main(args: Args) -> int:
 
 
 def measure(args: Args) -> int:
-    """Evaluate policies in all missing conditions, print the progress, and return the number of evaluations."""
-    rows, started = missing_rows(args), time.perf_counter()
-    for number, row in enumerate(rows, 1):
+    """Evaluate policies in all missing conditions, print the results, and return the number of evaluations."""
+    rows = missing_rows(args)
+    for row in tracked(rows, "evaluations"):
         values = measure_row(args, *row)
         gc.collect()  # frees the device memory of the environment
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
-        spent = time.perf_counter() - started
-        rates = ", ".join(f"{key} {values[key]:.4g}" for key in PROGRESS if key in values)
-        times = f"{spent / 60:.1f} min, {spent / number * (len(rows) - number) / 60:.1f} min left"
-        print(f"{number}/{len(rows)} {' '.join(map(str, row))}: {rates}; {times}", flush=True)
-    print(f"{len(rows)} rows measured, in {args.out}; --save-to-policies saves them")
+        announce(
+            f"{' '.join(map(str, row))}: {', '.join(f'{key} {values[key]:.4g}' for key in SHOWN if key in values)}"
+        )
+    announce(f"{len(rows)} rows measured, in {args.out}; --save-to-policies saves them")
     return len(rows)
 
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
 import warp as wp
 
-from jumper_warp import Env, make_task, mdp
+from jumper_warp import make_task, mdp
+from jumper_warp.recipe import Recipe
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.runner import train
+from jumper_warp.training import train
 from jumper_warp.utils.output import output_dir
 from support.scripts import DeviceArgs, report, run_script
 
@@ -39,11 +39,6 @@ TASK = make_task("vertical-jump")
 TASK = replace(TASK, rewards=(*TASK.rewards, mdp.RewardTerm(even_load, weight=5.0, spread=50.0)))
 
 
-def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
-    """Return a training environment with the reward term for an even load; argument of `train`."""
-    return Env(TASK, num_envs, seed=seed, device=str(device))
-
-
 @dataclass(frozen=True)
 class Args(DeviceArgs):
     """Flags of the training with a new reward term."""
@@ -60,7 +55,7 @@ def main(args: Args) -> dict:
     ppo = PpoCfg(num_steps=args.num_steps)
     cfg = TrainCfg(num_envs=args.num_envs, max_iterations=args.iterations, log_interval=1, log_root=folder / "logs",
                    ppo=ppo, device=args.device, tensorboard=False)  # fmt: skip
-    result = train(cfg, make_env)
+    result = train(Recipe(TASK, cfg))
     values = {
         "episode_reward_even_load": result.metrics["Episode_Reward/even_load"],
         "mean_reward": result.metrics.get("Train/mean_reward"),

@@ -1,21 +1,18 @@
-"""Draw a composite picture and a film of every policy, and the pictures of the README.
+"""Draw a composite picture of every policy, and the film of the README.
 
     python experiments/policy_pictures.py --policies vertical_jump walking_flat --out outputs/pictures
     python experiments/policy_pictures.py --save-to-policies
 
 Every policy performs its task once, on SolverJumper with nominal robots. `walk_jump_walk` is one robot with three
-policies. `--save-to-policies` writes `picture.webp` into the policies' folders.
+policies, and a film. `--save-to-policies` writes `picture.webp` into the policies' folders.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from jumper_warp.evaluation.attitude import AttitudePlayFlags
 from jumper_warp.evaluation.courses import CourseLog
@@ -32,7 +29,6 @@ from jumper_warp.policies.folder import add_files
 from jumper_warp.robot.grounds import platform
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.film import write_film
 from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.recording import Recording
@@ -40,8 +36,7 @@ from support.scripts import ThreadArgs, announce, prepare, report, run_script, t
 
 COURSE = "walk_jump_walk"  # A script with three policies
 SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
-TILE = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude", COURSE)
-TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
+FILM_SIZE = (560, 316)  # [px]
 
 
 @dataclass(frozen=True)
@@ -91,12 +86,10 @@ SHOTS = {
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script that draws pictures and films of policies."""
+    """Flags of the script that draws pictures of policies."""
 
     policies: tuple[str, ...] = (*SHOTS, COURSE)  # Names of the policies to draw
-    films: bool = True  # Also make films
     save_to_policies: bool = False  # Write picture.webp into the policies' folders
-    readme: Path | None = None  # Folder for the README's tile and animation
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.policies) - {*SHOTS, COURSE})
@@ -120,7 +113,7 @@ def record(name: str) -> Recording:
 
 
 def main(args: Args) -> dict:
-    """Draw the pictures and films of all policies, and return the sizes of the files [KiB] by name."""
+    """Draw the pictures of all policies and the film of COURSE, and return the sizes of the files [KiB] by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
     for name in tracked(args.policies, "drawing policies"):
@@ -128,35 +121,13 @@ def main(args: Args) -> dict:
         title = "walk, jump up, walk, jump ahead, walk" if name == COURSE else SHOTS[name].title
         picture = write_picture(recording, folder / f"{name}.webp", title=title)
         paths = [picture]
-        if args.films:
-            paths.append(write_film(recording, folder / f"{name}.mp4", size=FILM_SIZE))
-        if args.save_to_policies and name != COURSE:
+        if name == COURSE:
+            paths.append(write_film(recording, folder / f"{name}_film.webp", size=FILM_SIZE, fps=12.0))
+        elif args.save_to_policies:
             add_files(find_policy(name), {"picture.webp": picture.read_bytes()})
-        if args.readme is not None and name == COURSE:
-            paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=12.0))
         sizes |= {f"{path.name} [KiB]": path.stat().st_size / 1024 for path in paths}
         announce(f"{', '.join(path.name for path in paths)} drawn")
-    if args.readme is not None:
-        save_tile([folder / f"{name}.webp" for name in TILE], args.readme / "policies.webp")
     return report(args, folder, sizes, f"Policies drawn: {len(args.policies)}", ())
-
-
-def save_tile(paths: list[Path], path: Path) -> None:
-    """Write a picture that shows several in two columns, each below the shorter column; the longer one is cut off."""
-    columns, heights = ([], []), [0, 0]
-    for each in paths:
-        picture = Image.open(each).convert("RGB")
-        picture = picture.resize((TILE_WIDTH, picture.height * TILE_WIDTH // picture.width))
-        column = heights.index(min(heights))
-        columns[column].append((heights[column], picture))
-        heights[column] += picture.height
-    tile = Image.new("RGB", (2 * TILE_WIDTH, min(heights)))
-    for column, placed in enumerate(columns):
-        for top, picture in placed:
-            tile.paste(picture, (TILE_WIDTH * column, top))
-    data = io.BytesIO()
-    tile.save(data, "webp", quality=85, method=6)
-    write_atomically(path, data.getvalue())
 
 
 if __name__ == "__main__":

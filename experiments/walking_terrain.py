@@ -16,14 +16,13 @@ import numpy as np
 
 from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
+from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean, rate
 from jumper_warp.viz.plots import figure
 from support.scripts import run_script
-from support.walks import walked_fraction
 
 SECONDS = 10.0  # [s] Time of each walk
 
@@ -46,6 +45,15 @@ class Args(EvaluationArgs):
         check_velocity_settings(self.num_robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:
             raise InputError(f"speed must be in (0, 0.6] m/s, so that the walk ends on the tile, got {self.speed}")
+
+
+def walked_fraction(walks: VelocityLog) -> np.ndarray:
+    """Return the fraction, (robots,), of the commanded distance ahead that each robot walked until its fall, at most 1.
+
+    Distance is along the robot's present heading; SETTLING_TIME at the start is not part of the commanded distance.
+    """
+    distance = np.nansum(walks.velocity_history()[..., 0], axis=0) * walks.step_dt
+    return np.clip(distance / (walks.commands[:, 0, 0] * (walks.seconds - SETTLING_TIME)), 0.0, 1.0)
 
 
 def main(args: Args) -> dict:

@@ -10,10 +10,10 @@ import pytest
 import torch
 import warp as wp
 
+from ground_helpers import hardest
 from hold_height import hold_height
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
-from support.soak import hardest
 
 wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")

@@ -11,7 +11,6 @@ from jumper_warp import registry
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import (
     TASKS,
-    TaskEntry,
     find_task,
     load_task_module,
     make_task,
@@ -75,50 +74,9 @@ def test_tasks_are_found_by_name_and_alias():
     assert [make_task(name).name for name in PROJECT_TASKS] == list(PROJECT_TASKS)
 
 
-def test_refusal_of_an_unknown_task_lists_the_known_tasks():
-    with pytest.raises(InputError, match=r"unknown task 'swim'; there are vertical-jump, .*, attitude; a"):
-        make_task("swim")
-
-
 @pytest.mark.parametrize("name", ["vertical_jump_mars", "Olympus_Vertical-Jump_Mars", "vertical-jump_mars"])
 def test_dash_and_underscore_are_the_same_in_names_of_tasks(name):
     assert find_task(name)[0] == task_name(name) == "vertical-jump-mars"
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("vertical_jmup", "; a task of your own needs --task-module FILE.py; did you mean 'vertical-jump'"),
-        ("Olympus-Wlak", "did you mean 'Olympus-Walk'"),
-        ("walking-flat", "'walking-flat' is a policy, not a task; its task is velocity-flat"),
-    ],
-)
-def test_refusal_of_an_unknown_task_gives_advice(name, message):
-    with pytest.raises(InputError, match=message):
-        make_task(name)
-
-
-@pytest.mark.parametrize(
-    ("doc", "sentence"),
-    [
-        ("Return the task. It jumps.", "The task"),
-        ("Jump to a\n    height 0.5 m up.\n\n    More.", "Jump to a height 0.5 m up"),
-        ("", ""),
-    ],
-)
-def test_description_without_about_is_the_factorys_first_sentence(doc, sentence):
-    def make():
-        pass
-
-    make.__doc__ = doc
-    assert TaskEntry(make).description == sentence
-    assert TaskEntry(make, about="jump").description == "jump"
-
-
-def test_trainer_settings_are_those_of_the_task():
-    assert trainer_settings("vertical-jump") == PpoCfg(gamma=0.99)
-    assert trainer_settings("Olympus-Horizontal-Jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
-    assert trainer_settings("omnidirectional-jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
 
 
 def test_registered_task_has_its_name_alias_settings_and_origin():
@@ -132,9 +90,7 @@ def test_registered_task_has_its_name_alias_settings_and_origin():
 
 @pytest.mark.parametrize(
     ("name", "aliases", "taken"),
-    [("vertical-jump", (), "vertical-jump"), ("Olympus-Vertical-Jump", (), "Olympus-Vertical-Jump"),
-     ("vertical_jump", (), "vertical_jump"),
-     ("my-jump", ("horizontal-jump",), "horizontal-jump"), ("my-jump", ("Olympus-Vertical-Jump",), "Olympus")],
+    [("vertical-jump", (), "vertical-jump"), ("my-jump", ("Olympus-Vertical-Jump",), "Olympus")],
 )  # fmt: skip
 def test_name_that_is_taken_is_refused(name, aliases, taken):
     with pytest.raises(InputError, match=f"there is a task '{taken}.* already, of jumper_warp.tasks.jump"):
@@ -161,35 +117,6 @@ def test_cell_that_runs_again_replaces_its_task():
     assert list(TASKS).count("low-jump") == 1
 
 
-@pytest.mark.parametrize("origin", ["another function", "another module"])
-def test_task_of_another_origin_is_replaced_on_request_only(origin):
-    exec(CELL.replace("GRAVITY", "9.81"), {"__name__": "__main__"})
-    source = CELL.replace("GRAVITY", "3.71")
-    source = source.replace("low_jump", "lower_jump") if origin == "another function" else source
-    module = {"__name__": "__main__" if origin == "another function" else "my_tasks"}
-    with pytest.raises(InputError, match="there is a task 'low-jump' already, of __main__"):
-        exec(source, module)
-    exec(source.replace('("Low",)', '("Low",), replace=True'), module)
-    assert make_task("low-jump").gravity == 3.71
-
-
-def test_replaced_task_takes_no_name_of_another():
-    with pytest.raises(InputError, match="there is a task 'horizontal-jump' already"):
-        register_task("vertical-jump", renamed("vertical-jump"), aliases=("horizontal-jump",), replace=True)
-
-
-def test_task_with_another_name_than_registered_is_refused():
-    register_task("my-jump", renamed("vertical-jump"))
-    with pytest.raises(InputError, match=r"'my-jump' of .* calls itself 'vertical-jump'"):
-        make_task("my-jump")
-
-
-def test_factory_that_returns_no_task_is_refused():
-    register_task("my-jump", lambda: 3)
-    with pytest.raises(InputError, match="expected a TaskCfg, got int"):
-        make_task("my-jump")
-
-
 # ---------------------------------------------------------------------- files and modules
 
 
@@ -207,49 +134,13 @@ def test_module_is_loaded_by_name(tmp_path, monkeypatch):
     assert load_task_module("my_module").__name__ == TASKS["low-jump"].origin == "my_module"
 
 
-@pytest.mark.parametrize(
-    "name", ["json", "os", "test", "numpy", "torch", "pytest", "jumper_warp", "kernels", "hypothesis", "__main__"]
-)
+@pytest.mark.parametrize("name", ["json", "torch"])
 def test_file_with_the_name_of_another_module_is_refused(tmp_path, name):
     (tmp_path / f"{name}.py").write_text("raise SystemExit('run')")
     before = sys.modules.get(name)
     with pytest.raises(InputError, match=f"'{name}' is the name of another module; give the file another name"):
         load_task_module(str(tmp_path / f"{name}.py"))
     assert sys.modules.get(name) is before
-
-
-def test_second_file_of_a_name_is_refused(tmp_path):
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "my_tasks.py").touch()
-    load_task_module(str(tmp_path / "a" / "my_tasks.py"))
-    with pytest.raises(InputError, match="is the name of another module"):
-        load_task_module(str(tmp_path / "b" / "my_tasks.py"))
-
-
-@pytest.mark.parametrize("name", ["my-tasks.py", "class.py", "1st.py", "my tasks.py"])
-def test_file_that_python_cannot_name_is_refused(tmp_path, name):
-    (tmp_path / name).touch()
-    with pytest.raises(InputError, match="must be one that Python can import"):
-        load_task_module(str(tmp_path / name))
-
-
-def test_file_without_the_ending_of_python_is_refused(tmp_path):
-    (tmp_path / "my_hops.txt").touch()
-    with pytest.raises(InputError, match=r"my_hops\.txt: the name of a task's file must end in \.py"):
-        load_task_module(str(tmp_path / "my_hops.txt"))
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("missing.py", "missing.py: no such file .tasks of your own"), ("missing/tasks", "no such file"),
-     ("no_such", "no module 'no_such'"),
-     ("no_such.tasks", "no module 'no_such.tasks'"), (".", "no module"), ("jumper_warp.no_such", "no module")],
-)  # fmt: skip
-def test_missing_file_or_module_is_refused(tmp_path, monkeypatch, name, message):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=message):
-        load_task_module(name)
 
 
 @pytest.mark.parametrize(
@@ -273,19 +164,6 @@ def test_refusal_of_a_faulty_file_names_the_line_and_registers_nothing(tmp_path,
     path.write_text(text + code + "\n")
     with pytest.raises(InputError, match=rf"my_tasks.py:{text.count(chr(10)) + 1}: .*{message}"):
         load_task_module(str(path))
-    assert "my_tasks" not in sys.modules and tuple(TASKS) == PROJECT_TASKS
-
-
-@pytest.mark.parametrize(
-    ("code", "kind"),
-    [("1 / 0", ZeroDivisionError), ("import no_such_module", ModuleNotFoundError), ("int('x')", ValueError)],
-)
-def test_exception_in_a_file_propagates_and_registers_nothing(tmp_path, code, kind):
-    path = tmp_path / "my_tasks.py"
-    path.write_text(TASK_FILE + REGISTER + code)
-    with pytest.raises(kind) as caught:
-        load_task_module(str(path))
-    assert not isinstance(caught.value, InputError)
     assert "my_tasks" not in sys.modules and tuple(TASKS) == PROJECT_TASKS
 
 
@@ -329,27 +207,6 @@ def test_saved_configuration_loads_no_installed_task(install):
     assert "their_tasks" not in sys.modules and "low-jump" not in TASKS
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("their_tasks:missing", "task 'low-jump' of package their_tasks cannot be loaded: AttributeError"),
-        ("their_missing:low_jump", "cannot be loaded: ModuleNotFoundError: No module named 'their_missing'"),
-        ("their_tasks:PpoCfg.gamma", "their_tasks:PpoCfg.gamma is no function"),
-    ],
-)
-def test_installed_task_that_cannot_be_loaded_is_refused(install, value, message):
-    install("their_tasks", {"low-jump": value})
-    with pytest.raises(InputError, match=message):
-        make_task("low-jump")
-
-
-def test_task_in_two_packages_is_refused(install):
-    install("their_tasks", {"low-jump": "their_tasks:low_jump"})
-    install("their_others", {"low-jump": "their_others:low_jump"})
-    with pytest.raises(InputError, match="'low-jump' is in several packages: their_"):
-        make_task("low-jump")
-
-
 def test_package_cannot_replace_a_task_of_the_project(install):
     install("their_tasks", {"vertical-jump": "their_tasks:low_jump"})
     assert make_task("vertical-jump").name == "vertical-jump" and "their_tasks" not in sys.modules
@@ -378,8 +235,3 @@ def test_public_names_are_imported_lazily():
     assert sorted(jumper_warp.__all__) == [
         "Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task",
     ]  # fmt: skip
-
-
-def test_unknown_name_raises_attribute_error():
-    with pytest.raises(AttributeError, match="has no attribute 'JumpEnv'"):
-        _ = jumper_warp.JumpEnv

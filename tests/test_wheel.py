@@ -15,7 +15,6 @@ from jumper_warp.utils.assets import policy_tasks
 ROOT = Path(__file__).parents[1]
 SOURCES = ("jumper_warp", "kernels", "assets", "setup.py", "pyproject.toml", "README.md", "LICENSE")
 BUILD = "from setuptools.build_meta import build_wheel; print(build_wheel('.'))"
-INSTALL = ("-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
 USE_PACKAGE = """
 import jumper_warp
 from jumper_warp.cli.main import main
@@ -28,10 +27,6 @@ main(["list", "--json"])
 load_description()
 for name in policy_tasks():
     load_policy(name)  # checks every file
-"""
-PRINT_BOTH = """
-import kernels, jumper_warp.kernels.scalar
-print(kernels.OWNER, kernels.__file__, jumper_warp.kernels.scalar.__file__)
 """
 
 
@@ -59,16 +54,6 @@ def wheel(tmp_path_factory):
     return tree / run(BUILD, tree)[-1]
 
 
-@pytest.fixture(scope="module")
-def other_wheel(tmp_path_factory):
-    """Path of the wheel of another project whose only package is `kernels`."""
-    tree = tmp_path_factory.mktemp("other")
-    (tree / "kernels").mkdir()
-    (tree / "kernels" / "__init__.py").write_text("OWNER = 'other'\n")
-    (tree / "pyproject.toml").write_text('[project]\nname = "kernels"\nversion = "1.0"\n')
-    return tree / run(BUILD, tree)[-1]
-
-
 def test_wheel_holds_one_package_and_all_assets(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for folder, inside in (("jumper_warp", ""), ("kernels", "jumper_warp/"), ("assets", "jumper_warp/")):
@@ -88,17 +73,6 @@ def test_installed_package_finds_assets_and_policies_from_another_folder(wheel, 
     package, *listed = run(USE_PACKAGE, elsewhere, site)  # its path, and the JSON of `jumper list`
     assert Path(package).is_relative_to(site)
     assert [policy["name"] for policy in json.loads("\n".join(listed))["policies"]] == list(policy_tasks())
-
-
-@pytest.mark.parametrize("ours_first", [True, False])
-def test_package_named_kernels_of_another_project_can_be_installed_too(wheel, other_wheel, ours_first, tmp_path):
-    site = tmp_path / "site"
-    for path in (wheel, other_wheel) if ours_first else (other_wheel, wheel):
-        returncode, _, errors = python(*INSTALL, "--target", str(site), str(path), folder=tmp_path)
-        assert returncode == 0 and "already exists" not in errors, errors
-    (printed,) = run(PRINT_BOTH, tmp_path, site)
-    inside = (str(site / "kernels" / "__init__.py"), str(site / "jumper_warp" / "kernels" / "scalar.py"))
-    assert printed == " ".join(("other", *inside))
 
 
 def test_kernels_folder_of_the_source_tree_refuses_import():

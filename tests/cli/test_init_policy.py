@@ -7,7 +7,6 @@ import torch
 
 from cli_helpers import run
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.train import command_line
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.checkpoint import load_checkpoint
 
@@ -38,13 +37,6 @@ def test_training_starts_with_the_weights_of_the_policy(begun):
     torch.testing.assert_close(log_std.exp(), torch.full((12,), 0.3), atol=1e-6, rtol=0.0)
 
 
-def test_training_starts_from_a_run(begun, tmp_path, capsys):
-    cli.main([*TRAIN, "--init-policy", str(begun), "--log-root", str(tmp_path)])
-    assert f"starts from {begun}" in capsys.readouterr().err.splitlines()
-    (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
-    assert json.loads((folder / "config.json").read_text())["train"]["init_policy"] == str(begun)
-
-
 def test_latest_or_new_resumes_the_run_that_it_started(tmp_path, capsys):
     outputs = []
     for iterations in ("1", "2"):
@@ -64,7 +56,6 @@ def test_latest_or_new_resumes_the_run_that_it_started(tmp_path, capsys):
     [
         (["--init-policy", "vertical_jump"], "init_policy: observation "),
         (["--init-policy", "slippery_jump", "--ppo.symmetry", "off"], "pass --ppo.hidden 512 256 256"),
-        (["--init-policy", "no_jump"], "no_jump"),
         (["--init-policy", "slippery_jump", "--resume", "latest"], "not both"),
         (["--init-policy", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not supported"),
     ],
@@ -73,8 +64,3 @@ def test_refuses_unsuitable_initial_policies(more, message, capsys, tmp_path):
     code, _, err = run(capsys, *TRAIN, *more, "--log-root", str(tmp_path))
     assert code == 2 and message in " ".join(err)
     assert not list(tmp_path.iterdir())
-
-
-def test_saved_command_line_omits_start_from():
-    args = ["push", "--init-policy", "pusher", "--seed", "3", "--init_policy=x", "--resume", "latest"]
-    assert command_line(args, []) == "jumper train push --seed 3"

@@ -6,9 +6,7 @@ import shutil
 import pytest
 
 from cli_helpers import run
-from jumper_warp.cli.info import results_table
-from jumper_warp.policies.catalog import first_paragraph, summarise
-from jumper_warp.policies.folder import add_files, save_policy
+from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.runs import load_policy
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
@@ -79,15 +77,6 @@ def test_info_of_a_policy_fits_a_screen_and_has_its_metrics(capsys, name):
     assert json.loads(run(capsys, "info", name, "--json")[1])["rows"][0]["metrics"] == metrics
 
 
-def test_table_of_a_policy_has_the_first_seed_of_each_condition():
-    def row(condition, seed, rate):
-        metric = {"value": rate, "unit": None, "trials": 10}
-        return {"condition": condition, "seed": seed, "conditions": {}, "metrics": {"success_rate": metric}}
-
-    rows = [row("nominal", 0, 0.5), row("nominal", 1, 0.6), row("gains_0.6", 0, None), row("gains_0.6", 1, 0.8)]
-    assert results_table(rows) == ["condition  success", "nominal     50.0 %", "gains 0.6         ", "10 trials a line"]
-
-
 @pytest.mark.parametrize("name", ["vertical-jump", "velocity_trot", "Olympus-Walk", "attitude"])
 def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
     task, flag = make_task(name), ["--task"] if name == "attitude" else []
@@ -98,38 +87,6 @@ def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
     assert content["rewards"] == {term.name: term.numbers["weight"] for term in task.rewards}
     assert content["terminations"] == [term.name for term in task.terminations]
     assert content["observation_sizes"]["actor"] == len(task.observation_names)
-
-
-@pytest.mark.parametrize(
-    ("args", "start"),
-    [
-        (["vertical_jump"], "vertical_jump: policy for the task vertical-jump"),
-        (["vertical-jump"], "vertical-jump: jump to a height"),
-        (["vertical_jump", "--task"], "vertical-jump: jump to a height"),
-        (["mars-springs-jump"], "mars_springs_jump: policy for"),
-        (["attitude"], "attitude: policy for"),
-        (["velocity_flat"], "velocity-flat: walk"),
-    ],
-)
-def test_spelling_decides_between_a_task_and_a_policy_of_one_name(capsys, args, start):
-    assert run(capsys, "info", *args)[1].startswith(start)
-
-
-def test_info_of_a_policy_without_metrics_or_page_shows_its_folder(capsys, tmp_path):
-    folder = copy_of("attitude", tmp_path / "mine")
-    (folder / "README.md").unlink()
-    code, out, _ = run(capsys, "info", str(folder))
-    assert code == 0 and f"jumper evaluate {folder}" in out and "nominal" not in out
-    assert summarise(folder).success is summarise(folder).error is None
-
-
-def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
-    folder = copy_of("vertical_jump", tmp_path / "mine")
-    row = json.loads((POLICIES / "vertical_jump/metrics.json").read_text())["rows"][0]
-    saved = {"schema": "jumper-warp metrics", "version": 1, "conditions": row["conditions"], "metrics": row["metrics"]}
-    add_files(folder, {"metrics.json": json.dumps(saved).encode()})
-    assert summarise(folder).success == row["metrics"]["success_rate"]["value"]
-    assert "as evaluated   96.7 %" in run(capsys, "info", str(folder))[1]
 
 
 def test_info_refuses_metrics_that_differ_from_the_manifest(tmp_path, capsys):
@@ -149,17 +106,3 @@ def test_info_refuses_a_page_that_is_a_link_to_another_folder(tmp_path, capsys, 
     (folder / "README.md").symlink_to(target)
     code, out, err = run(capsys, "info", str(folder))
     assert (code, out) == (2, "") and len(err) == 1 and "README.md" in err[0]
-
-
-@pytest.mark.parametrize(("file", "text"), [("metrics.json", '{"metrics": 3}'), ("config.json", "{}")])
-def test_info_refuses_a_folder_with_malformed_files(tmp_path, capsys, file, text):
-    folder = copy_of("attitude", tmp_path / "mine")
-    (folder / file).write_text(text)
-    code, out, err = run(capsys, "info", str(folder))
-    assert (code, out) == (2, "") and len(err) == 1 and f"{folder}: not a policy's folder" in err[0]
-
-
-def test_first_paragraph_is_text_without_markup():
-    page = "# Title\n\n![picture](a.webp)\n\nIt jumps `up`, see\n[the page](b.md#c).\n\nMore.\n"
-    assert first_paragraph(page) == "It jumps up, see the page."
-    assert first_paragraph("# Title\n") == ""

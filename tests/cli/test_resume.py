@@ -8,10 +8,8 @@ import pytest
 from cli_helpers import run as command
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import parse_train
-from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import with_springs
-from jumper_warp.utils.locks import write_lock
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
 SAVED = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
@@ -161,33 +159,3 @@ def test_refuses_another_latency_of_a_nominal_robot(capsys, run, tmp_path):
 def test_refuses_run_of_another_task(capsys, run):
     _, _, err = command(capsys, "train", "horizontal-jump", "--resume", str(run))
     assert "of a run of vertical-jump, not of horizontal-jump" in err[-1]
-
-
-def test_refuses_invalid_saved_settings(capsys, run):
-    resave(run, train={"num_envs": "many"})
-    code, _, err = train(capsys, "--resume", str(run))
-    assert code == 2 and len(err) == 1 and "settings in its configuration" in err[0]
-
-
-@pytest.mark.parametrize("name", ["nope", "nope/checkpoints", "nope/iteration_000001.pt", "."])
-def test_refuses_paths_without_a_run(capsys, tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = train(capsys, "--resume", name)
-    assert (code, out) == (2, "")
-    missing = "" if name == "." else "no such file or folder, "
-    assert err == [f"jumper: {name}: {missing}no run to resume; pass a run's folder, one of its checkpoints, or latest"]
-
-
-def test_resume_without_value_exits_with_2(capsys):
-    assert train(capsys, "--resume")[0] == 2
-
-
-def test_new_training_has_default_task_settings():
-    assert parse_train(["vertical-jump"])[0].task == make_task("vertical-jump")
-
-
-def test_run_that_another_process_writes_is_refused(capsys, run):
-    with write_lock(run):
-        code, out, err = train(capsys, "--resume", str(run), "--max-iterations", "2")
-    assert (code, out) == (2, "")
-    assert err == [f"jumper: {run}: another process is writing this folder; wait for its end, or stop it"]

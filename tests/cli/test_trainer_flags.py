@@ -1,13 +1,10 @@
 """`jumper train` refuses flags that the trainer does not use."""
 
-import dataclasses
-
 import pytest
 
 from cli_helpers import run
 from jumper_warp.cli.train import parse_train
-from jumper_warp.rl.cfg import RSL_RL_UNUSED, PpoCfg, TrainCfg
-from jumper_warp.rl.rsl_rl import rsl_rl_config
+from jumper_warp.rl.cfg import PpoCfg
 
 
 @pytest.mark.parametrize(
@@ -35,22 +32,3 @@ def test_preset_leaves_out_flags_that_the_trainer_does_not_use(capsys):
     assert "final-desired-kl" not in capsys.readouterr().err
     cfg = parse_train("vertical-jump --preset laptop".split())[0].train
     assert (cfg.ppo.final_desired_kl, cfg.max_seconds) == (0.005, 0.0)
-
-
-class ReadSettings:
-    """Settings of PPO that record which ones are read."""
-
-    def __init__(self):
-        self.read = set()
-
-    def __getattr__(self, name):
-        self.read.add(name)
-        return getattr(PpoCfg(), name)
-
-
-def test_list_of_unused_settings_agrees_with_the_configuration_of_rsl_rl():
-    cfg = ReadSettings()
-    rsl_rl_config(cfg, 100, 1)
-    names = {spec.name for spec in dataclasses.fields(PpoCfg)} - cfg.read - {"symmetry"}  # which is refused by value
-    assert {f"ppo.{name}" for name in names} == {name for name in RSL_RL_UNUSED if name.startswith("ppo.")}
-    assert {name for name in RSL_RL_UNUSED if "." not in name} <= {spec.name for spec in dataclasses.fields(TrainCfg)}

@@ -10,14 +10,11 @@ import pytest
 
 from cli_helpers import run
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.main import split_task_modules
-from jumper_warp.cli.train import command_line
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.policies.runs import load_policy, open_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, load_task_module, make_task
-from jumper_warp.rl.checkpoint import save_checkpoint
-from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
+from jumper_warp.tasks.saving import TaskError
 
 LEVEL_JUMP = Path(__file__).parents[1] / "helpers" / "level_jump.py"
 TASK = '''\
@@ -125,67 +122,11 @@ def play(source, *args):
     return ["play", str(source), "--height", "0.6", "--seconds", "0.1", "--device", "cpu", *args]
 
 
-def test_task_modules_are_split_from_other_arguments():
-    args = ["a", "--task-module", "x.py", "--b", "--task-module=pack.age", "--task_module", "y.py", "c"]
-    assert split_task_modules(args) == (["a", "--b", "c"], ["x.py", "pack.age", "y.py"])
-
-
 def test_list_shows_tasks_of_a_module_and_policies(capsys, path):
     code, out, _ = run(capsys, "list", f"--task-module={path}")
     lines = [" ".join(line.split()) for line in out.splitlines()]
     assert code == 0 and any(line.startswith("tame-jump ") for line in lines)
     assert "vertical-jump jump to a height vertical_jump" in lines
-
-
-def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monkeypatch):
-    info = tmp_path / "their_tasks-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-tasks\nVersion: 1.0\n")
-    points = "[jumper_warp.tasks]\nlow-jump = my_jumps_installed:low_jump\nbad-jump = my_jumps_installed:bad\n"
-    (info / "entry_points.txt").write_text(points)
-    (tmp_path / "my_jumps_installed.py").write_text(TASK[: TASK.index("register_task(")] + "def bad(): 1 / 0\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    code, out, err = run(capsys, "list", "--json")
-    tasks = {task["name"]: task for task in json.loads(out)["tasks"]}
-    assert code == 0 and (tasks["low-jump"]["module"], tasks["low-jump"]["package"]) == (
-        "my_jumps_installed", "their-tasks",
-    )  # fmt: skip
-    assert "bad-jump" not in tasks
-    assert "task bad-jump of package their-tasks is left out: ZeroDivisionError: division by zero" in err
-
-
-@pytest.mark.parametrize(("doc", "head"), [("Only what a training needs is this file's.", True), ("", False)])
-def test_info_of_a_users_task_has_its_module_and_its_description_once(capsys, path, tmp_path, doc, head):
-    file = tmp_path / "my_jumps.py"
-    file.write_text(TASK.replace("Only what a training needs is this file's.", doc))
-    code, out, err = run(capsys, "info", "tame-jump", "--task-module", str(file))
-    assert (code, err) == (0, [])
-    lines = [line.rstrip() for line in out.splitlines()]
-    assert f"train         jumper train tame-jump --task-module {file}" in lines
-    assert lines[0] == ("tame-jump: Only what a training needs is this file's" if head else "tame-jump")
-    assert out.count("Only what") == head and "." not in lines and lines[2].startswith("observation")
-
-
-def test_functions_of_a_neighbour_are_saved_and_found_again(capsys, tmp_path):
-    (tmp_path / "my_jumps.py").write_text(
-        TASK.replace("@wp.func\ndef too_high", "from my_ends import too_high\n\n\ndef unused")
-    )
-    end = TASK[TASK.index("@wp.func\ndef too_high") : TASK.index("def tame_jump")]
-    (tmp_path / "my_ends.py").write_text(TASK[: TASK.index("@wp.func")] + end)
-    sys.modules.pop("my_ends", None)
-    before = list(sys.path)
-    module = load_task_module(str(tmp_path / "my_jumps.py"))
-    saved = task_to_json(make_task("low-jump"))
-    assert saved["terminations"][-1]["func"] == "my_ends:too_high" and sys.path == before
-    assert task_from_json(saved, [module]) == make_task("low-jump")
-    with pytest.raises(TaskError, match="needs 'my_ends:too_high'"):
-        task_from_json(saved | {"rewards": [], "events": [], "observations": saved["observations"] | {"critic": []}})
-
-
-def test_help_lists_flags_of_the_users_task(capsys, path):
-    code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help-all")
-    assert code == 0 and "--env.rewards.base-at-rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
-    assert "--ppo.gamma FLOAT" in out and "(default: 0.9)" in out
 
 
 def test_training_saves_functions_by_module_and_name(runs):
@@ -210,25 +151,11 @@ def test_play_does_not_need_training_functions(capsys, runs, tmp_path):
     assert (tmp_path / "jump.rrd").is_file() and "my_jumps" not in sys.modules
 
 
-@pytest.mark.parametrize("modules", [True, False])
-def test_paper_has_no_values_of_a_users_task(capsys, runs, path, tmp_path, modules):
-    given = ["--task-module", path] * modules
-    flags = ["--num-jumps", "2", "--device", "cpu", "--out", str(tmp_path)]
-    code, out, err = run(capsys, "evaluate", str(runs["tame-jump"]), *flags, *given)
-    assert code == 0, err
-    assert "no jump rate " in out and not any(line.endswith(" paper") for line in out.splitlines())
-
-
 def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, *play(runs["low-jump"]))
     assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': pass the file" in err[0]
     assert "--task-module" in err[0] and "my_jumps" not in sys.modules
     assert run(capsys, *play(runs["low-jump"], "--task-module", path, "--out", str(tmp_path)))[0] == 0
-
-
-def test_play_with_randomization_refuses_missing_event_function(capsys, runs):
-    code, _, err = run(capsys, *play(runs["tame-jump"], "--randomize"))
-    assert code == 2 and "task.events[0] needs 'my_jumps:slow'" in err[-1]
 
 
 def test_recipe_uses_the_users_reward_function(runs, path):
@@ -239,14 +166,6 @@ def test_recipe_uses_the_users_reward_function(runs, path):
     task = Recipe.from_json(config, [module]).task
     assert task.rewards[0].func is module.base_at_rest is not rewards.base_at_rest
     assert task == make_task("tame-jump").with_terms("rewards", base_at_rest={"height": 0.4})
-
-
-def test_saved_command_line_includes_task_modules(path):
-    import json.decoder as module
-
-    args = ["tame-jump", "--seed", "3", "--resume", "latest", "--resume=x"]
-    expected = f"jumper train tame-jump --seed 3 --task-module {path} --task-module json.decoder"
-    assert command_line(args, [load_task_module(path), module]) == expected
 
 
 def test_resume_restores_the_users_task(capsys, runs, path, tmp_path):
@@ -275,35 +194,6 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4
-
-
-def test_train_refuses_functions_that_cannot_be_saved(capsys, tmp_path):
-    lost = TASK.replace("RewardTerm(base_at_rest", "RewardTerm(kept")
-    lost = lost.replace("def tame_jump", "kept, base_at_rest = base_at_rest, None\n\n\ndef tame_jump")
-    (tmp_path / "my_jumps.py").write_text(lost)
-    args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
-    code, out, err = run(capsys, *args)
-    assert (code, out) == (2, "") and "my_jumps:base_at_rest cannot be saved: define it under this name" in err[-1]
-    assert not (tmp_path / "tame-jump").exists()
-
-
-def test_registered_tasks_can_be_saved():
-    for name in TASKS:
-        Recipe(make_task(name)).check_saving()
-    with pytest.raises(TaskError):
-        Recipe(make_task("vertical-jump").with_terms("rewards", base_at_rest={"name": "a:b"})).check_saving()
-
-
-@pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])
-@pytest.mark.parametrize("command", ["train", "export", "play"])
-def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
-    config = {"train": {"task": "vertical-jump", "ppo": {}}, "env": {"task": task}}
-    state = {"iteration": 7, "ppo": {}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
-    save_checkpoint(tmp_path / "run" / "checkpoints", state)
-    source = ["vertical-jump", "--resume"] if command == "train" else []
-    code, out, err = run(capsys, command, *source, str(tmp_path / "run"))
-    assert (code, out) == (2, "") and len(err) == 1
-    assert f"the task has version {task.get('version')}, expected version 4; commit 05fa856 reads version 3" in err[0]
 
 
 @pytest.mark.parametrize(

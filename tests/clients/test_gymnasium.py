@@ -1,17 +1,11 @@
 """Gymnasium: autoreset modes, vector wrappers, one-world environments, statistics of episodes."""
 
-import re
-import warnings
-from functools import partial
-from typing import ClassVar
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
 from jumper_warp.envs.env import Env
@@ -44,18 +38,6 @@ def play(envs, steps=STEPS):
 
 
 # ---------------------------------------------------------------- autoreset modes
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_mode_is_where_wrappers_look(mode):
-    envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, device="cpu", autoreset_mode=mode.value)
-    assert envs.autoreset_mode is envs.metadata["autoreset_mode"] is mode
-    assert envs.device == torch.device("cpu")
-
-
-def test_unknown_mode_is_refused():
-    with pytest.raises(ValueError, match="autoreset_mode must be one of 'NextStep', 'SameStep', 'Disabled'"):
-        vector("sometimes")
 
 
 @pytest.mark.parametrize("tensors", [False, True])
@@ -98,14 +80,6 @@ def test_next_step_ignores_the_action_after_an_end_and_returns_a_first_observati
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_every_mode_counts_an_episode_once(mode):
-    envs = vector(mode)
-    envs.reset()
-    ends = sum(int((terminated | truncated).sum()) for _, _, terminated, truncated, _ in play(envs))
-    assert envs.env.skills[0].counters.termination_count.numpy().sum() == ends > N
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_episodes_have_the_same_length_in_every_mode(mode):
     task = TASK.with_terms("terminations", tilted={"angle": 3.0})
     envs = wrappers.RecordEpisodeStatistics(vector(mode, task))
@@ -139,14 +113,6 @@ def test_ended_episode_has_to_be_reset_without_automatic_resets():
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
         for action in ACTIONS:
             envs.step(action)
-
-
-@pytest.mark.parametrize("mask", [np.zeros(N, dtype=bool), np.ones(N - 1, dtype=bool), np.ones(N), "all"])
-def test_other_masks_are_refused(mask):
-    envs = vector(AutoresetMode.DISABLED)
-    envs.reset()
-    with pytest.raises(ValueError, match=f"reset_mask must be bool of shape \\({N},\\) with a True"):
-        envs.reset(options={"reset_mask": mask})
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
@@ -187,113 +153,6 @@ def test_final_info_has_the_statistics_that_the_wrapper_counts(tensors):
     assert seen > 1
 
 
-@pytest.mark.parametrize("tensors", [False, True])
-def test_arrays_and_tensors_are_accepted_as_actions(tensors):
-    envs = [vector(tensors=tensors) for _ in range(2)]
-    for each in envs:
-        each.reset()
-    for action in ACTIONS:
-        for a, b in zip(envs[0].step(action)[:4], envs[1].step(torch.from_numpy(action))[:4], strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
-# ---------------------------------------------------------------- Gymnasium's vector wrappers
-
-INAPPLICABLE = {"GrayscaleObservation", "ResizeObservation", "HumanRendering", "JaxToNumpy", "JaxToTorch"}
-"""Wrappers of images, of a window and of JAX."""
-WRAPPERS = {
-    "VectorizeTransformObservation": {
-        "wrapper": gymnasium.wrappers.TransformObservation, "func": np.tanh, "observation_space": None,
-    },
-    "VectorizeTransformAction": {
-        "wrapper": gymnasium.wrappers.TransformAction, "func": np.tanh, "action_space": None,
-    },
-    "VectorizeTransformReward": {"wrapper": gymnasium.wrappers.TransformReward, "func": np.tanh},
-    "DictInfoToList": {},
-    "TransformObservation": {"func": np.tanh},
-    "FilterObservation": {"filter_keys": ["actor"]},
-    "FlattenObservation": {},
-    "ReshapeObservation": {"shape": (-1, 1)},
-    "RescaleObservation": {"min_obs": np.float32(-1.0), "max_obs": np.float32(1.0)},
-    "DtypeObservation": {"dtype": np.float64},
-    "NormalizeObservation": {},
-    "TransformAction": {"func": np.tanh},
-    "ClipAction": {},
-    "RescaleAction": {"min_action": np.float32(-2.0), "max_action": np.float32(2.0)},
-    "TransformReward": {"func": np.tanh},
-    "ClipReward": {"min_reward": -1.0, "max_reward": 1.0},
-    "NormalizeReward": {},
-    "RecordEpisodeStatistics": {},
-    "RecordVideo": {"video_length": 3},
-    "ArrayConversion": {"env_xp": np, "target_xp": torch},
-    "NumpyToTorch": {},
-}  # fmt: skip
-"""Arguments of every other vector wrapper."""
-CONVERSIONS = {"ArrayConversion", "NumpyToTorch"}
-CASES = [(name, mode) for name in WRAPPERS for mode in MODES
-         if not (name in CONVERSIONS and mode is AutoresetMode.SAME_STEP)]  # fmt: skip
-"""Wrappers with modes; conversions have no array of objects, which `final_obs` is in SAME_STEP."""
-
-
-def test_every_vector_wrapper_is_listed():
-    assert WRAPPERS.keys() | INAPPLICABLE == set(wrappers.__all__)
-
-
-class Blank(gymnasium.Env):
-    """Environment of the same spaces without robots, for Gymnasium's own vector environment."""
-
-    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 60}
-    render_mode = "rgb_array"
-
-    def __init__(self, envs: GymVectorEnv):
-        self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
-
-
-def gymnasiums_refusal(wrap, envs, mode):
-    """Return the message by which a wrapper refuses Gymnasium's own vector environment, None if it works there."""
-    reference = gymnasium.vector.SyncVectorEnv([lambda: Blank(envs)] * N, autoreset_mode=mode)
-    try:
-        wrap(reference)
-    except ValueError as error:
-        return str(error)
-    return None
-
-
-@pytest.mark.parametrize(("name", "mode"), CASES)
-def test_vector_wrapper_works_in_the_modes_that_gymnasium_has_it_for(name, mode, tmp_path):
-    if module := {"RecordVideo": "moviepy", **dict.fromkeys(CONVERSIONS, "array_api_compat")}.get(name):
-        pytest.importorskip(module)
-    film = {"render_mode": "rgb_array", "render_size": (64, 48), "render_envs": 2} if name == "RecordVideo" else {}
-    envs = vector(mode, all_groups=name in ("FilterObservation", "FlattenObservation"), **film)
-    arguments = dict(WRAPPERS[name])
-    if name == "ReshapeObservation":
-        arguments["shape"] = (envs.env.num_obs, 1)
-    wrap = partial(getattr(wrappers, name), **arguments)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*autoreset mode is same-step")
-        if name not in {*CONVERSIONS, "RecordVideo"} and (refusal := gymnasiums_refusal(wrap, envs, mode)):
-            with pytest.raises(ValueError, match=re.escape(refusal)):
-                wrap(envs)
-            assert "autoreset_mode" in refusal
-            return
-        wrapped = wrap(envs, **({"video_folder": str(tmp_path / "films")} if film else {}))
-    tensors = name in CONVERSIONS
-    obs, _ = wrapped.reset(seed=1)
-    assert tensors or obs in wrapped.observation_space
-    ends = 0
-    for action in ACTIONS:
-        obs, reward, terminated, truncated, _ = wrapped.step(torch.from_numpy(action) if tensors else action)
-        assert isinstance(obs, torch.Tensor) if tensors else obs in wrapped.observation_space
-        assert np.isfinite(np.asarray(reward)).all() and reward.shape == (N,)
-        ended = np.asarray(terminated | truncated)
-        ends += ended.sum()
-        if mode is AutoresetMode.DISABLED and ended.any():
-            wrapped.reset(options={"reset_mask": ended})
-    assert ends > N
-    wrapped.close()
-    assert name != "RecordVideo" or any((tmp_path / "films").glob("*.mp4"))
-
-
 # ---------------------------------------------------------------- one world
 
 
@@ -330,26 +189,3 @@ def test_end_of_an_episode_is_explained():
         env.step(ACTIONS[0, 0])
     env.reset()
     env.step(ACTIONS[0, 0])
-
-
-def test_gymnasiums_own_vector_environment_works_on_it():
-    envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, vectorization_mode="sync", device="cpu")
-    assert envs.reset(seed=1)[0] in envs.observation_space
-    assert envs.step(np.zeros((2, 12), dtype=np.float32))[0] in envs.observation_space
-    envs.close()
-
-
-def test_record_video_films_one_world(tmp_path):
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
-    env = gymnasium.make("jumper_warp/VerticalJump-v0", device="cpu", render_mode="rgb_array", render_size=(64, 48))
-    env = RecordVideo(env, str(tmp_path / "films"), video_length=3)
-    env.reset(seed=1)
-    for action in ACTIONS[:5, 0]:
-        env.step(action)
-    env.close()
-    assert any((tmp_path / "films").glob("*.mp4"))
-
-
-def test_several_worlds_are_refused_by_make():
-    with pytest.raises(ValueError, match="make_vec takes num_envs"):
-        GymEnv(Env(TASK, 2, device="cpu"))

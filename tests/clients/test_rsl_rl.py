@@ -12,7 +12,6 @@ from jumper_warp.cli import evaluate, export, play, train
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.rl.rsl_rl import rsl_rl_config
@@ -46,28 +45,12 @@ def trained(tmp_path_factory, one_thread):
     return folder, runner
 
 
-def test_config_is_written_to_a_new_folder(tmp_path):
-    adapter("attitude").write_config(tmp_path / "logs" / "mine")
-    assert (tmp_path / "logs" / "mine" / "config.json").is_file()
-
-
 def test_random_network_distillation_trains(one_thread):
     rnd = {"rnd_cfg": {"weight": 2.0, "num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}}
     runner = OnPolicyRunner(adapter(), settings(**rnd), log_dir=None, device="cpu")
     assert runner.alg.rnd.initial_weight == pytest.approx(2.0 / 60.0)  # weight times the policy step [s]
     runner.learn(1)
     assert (runner.alg.intrinsic_rewards > 0.0).all()
-
-
-def test_wandb_offline_gets_the_environments_configuration(tmp_path, one_thread, monkeypatch):
-    wandb = pytest.importorskip("wandb")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.chdir(tmp_path)
-    logger = {"class_name": "WandbLogWriter", "project_name": "test"}
-    runner = OnPolicyRunner(adapter(), settings() | {"logger": logger}, log_dir=str(tmp_path), device="cpu")
-    runner.logger.init_logging_writer()
-    assert wandb.config["env_cfg"]["policy_dt_s"] == pytest.approx(1.0 / 60.0)
-    runner.learn(1)
 
 
 def test_policy_of_a_checkpoint_acts_as_rsl_rls(trained):
@@ -110,25 +93,3 @@ def test_checkpoint_without_the_environments_configuration_is_refused(trained, t
     path.with_name("config.json").write_text("{")
     with pytest.raises(CheckpointError, match=r"config\.json: not JSON"):
         open_policy(path)
-
-
-def test_checkpoint_of_another_observation_layout_is_refused(trained, tmp_path):
-    path = tmp_path / "model_7.pt"
-    path.write_bytes((trained[0] / "model_1.pt").read_bytes())
-    adapter("attitude").write_config(tmp_path)
-    with pytest.raises(PolicyError, match="must have the configured shape"):
-        open_policy(path)
-
-
-def test_checkpoint_of_another_format_is_refused(trained, tmp_path):
-    torch.save({"model_state_dict": {}, "iter": 3}, tmp_path / "model_3.pt")
-    (tmp_path / "config.json").write_bytes((trained[0] / "config.json").read_bytes())
-    with pytest.raises(CheckpointError, match=r"model_3\.pt: not of rsl-rl 5"):
-        open_policy(tmp_path)
-
-
-def test_code_in_a_checkpoint_does_not_run(trained, tmp_path):
-    torch.save({"actor_state_dict": {}, "iter": 3, "infos": print}, tmp_path / "model_3.pt")
-    (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(CheckpointError, match="not readable as tensors"):
-        open_policy(tmp_path / "model_3.pt")

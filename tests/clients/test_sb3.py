@@ -2,7 +2,6 @@
 
 import gymnasium
 import numpy as np
-import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
@@ -66,18 +65,3 @@ def test_sb3s_wrappers_and_evaluation_work():
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=N * 16, device="cpu")
     _, lengths = evaluate_policy(model, VecMonitor(Sb3VecEnv(vector())), n_eval_episodes=4, return_episode_rewards=True)
     assert len(lengths) == 4 and max(lengths) <= 12
-
-
-def test_attributes_are_those_of_the_vector_environment():
-    envs = Sb3VecEnv(vector(render_mode="rgb_array", render_size=(64, 48)))
-    assert (envs.render_mode, envs.get_attr("num_envs", [0, 2])) == ("rgb_array", [N, N])
-    assert envs.env_is_wrapped(VecMonitor) == [False] * N
-    envs.reset()
-    assert envs.render().shape[-1] == 3
-    envs.close()
-
-
-@pytest.mark.parametrize("arguments", [{"tensors": True}, {"autoreset_mode": "NextStep"}])
-def test_other_modes_are_refused(arguments):
-    with pytest.raises(ValueError, match="needs arrays and autoreset_mode 'SameStep'"):
-        Sb3VecEnv(vector(**arguments))

@@ -1,6 +1,5 @@
 """Differentiable closed loop: states and observations against the environment, gradients against differences."""
 
-import dataclasses
 from functools import cache
 
 import numpy as np
@@ -15,7 +14,6 @@ from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
-from jumper_warp.utils.errors import InputError
 
 G = 9.81  # [m/s^2]
 
@@ -120,14 +118,3 @@ def test_apex_gradients_by_weights_match_central_differences():
         torch.testing.assert_close(
             rows @ direction, (ends[0] - ends[1]) / (2.0 * h), rtol=1.0e-6, atol=1.0e-6 * float(rows.norm(dim=1).max())
         )
-
-
-def test_closed_loop_refuses_observation_latency_and_another_solver():
-    task = make_task("vertical-jump").on_level_ground()
-    delayed = dataclasses.replace(
-        task, randomization=dataclasses.replace(task.randomization, observation_latency=(0.0, 8))
-    )
-    with pytest.raises(InputError, match="without latency"):
-        ClosedLoop(Env(delayed, 1, device="cpu"))
-    with pytest.raises(InputError, match="on SolverJumper"):
-        ClosedLoop(Env(task, 1, solver="mujoco", device="cpu"))

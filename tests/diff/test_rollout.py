@@ -49,13 +49,6 @@ def test_threads_do_not_change_trajectories_and_gradients():
         np.testing.assert_array_equal(results[1][name], values, err_msg=name)
 
 
-def test_concurrent_slices_have_separate_settings(monkeypatch):
-    of, launched = Rollout(build_model(40, visuals=False), threads=2), []
-    monkeypatch.setattr(wp, "launch", lambda kernel, **call: launched.append(call["inputs"][1]))
-    of.run(push_off(1), *of.standing())
-    assert sorted(settings._ctype.first for settings in launched) == [worlds.first for worlds in of.slices] != [0, 0]
-
-
 def test_rollout_continues_from_end():
     whole = run(rollout(), defaults())
     first = rollout().run(push_off()[:5], *squat())
@@ -77,15 +70,6 @@ def test_a_wrench_acts_in_double_precision():
     assert added[1] == pytest.approx(added[0], rel=1.0e-5)
     # more than the speed [m/s] of a rigid robot of 14.5 kg, as the legs lag behind; less than of 4 kg
     assert 1.0e-7 * 2 * SUBSTEPS * DT / 14.6 < added[0] < 1.0e-7 * 2 * SUBSTEPS * DT / 4.0
-
-
-def test_trajectory_stores_below_two_kilobytes_per_policy_step():
-    """The trajectory is in double precision, with 4 and with the default number of physics steps in a policy step."""
-    for of in (rollout(), Rollout(rollout().dynamics.model, double=True)):
-        made = of.run(push_off(8), *squat())
-        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.filtered_target)
-        per_row = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (8 + 1)
-        assert per_row <= 2000.0  # [byte]
 
 
 def tensors():
@@ -193,69 +177,6 @@ def test_reverse_pass_refuses_changed_outputs_and_parameters_and_second_derivati
         gradient.square().sum().backward()
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"targets": np.zeros((2, 11))}, "targets must have shape"),
-        ({"targets": np.zeros((0, 12))}, "at least one policy step"),
-        ({"q": np.zeros(18)}, "q must have shape"),
-        ({"qd": np.zeros((18, 2))}, "qd must have shape"),
-        ({"wrench": np.zeros((3, 6))}, "wrench must have shape"),
-    ],
-)
-def test_run_refuses_other_shapes(changes, message):
-    q, qd = squat()
-    with pytest.raises(ValueError, match=message):
-        rollout().run(**({"targets": push_off(2), "q": q, "qd": qd} | changes))
-
-
-def test_run_refuses_the_other_precision():
-    with pytest.raises(ValueError, match="q must be float64"):
-        rollout().run(push_off(2), wp.zeros((19, 1), dtype=wp.float32), squat()[1])
-
-
-def test_backward_refuses_other_shapes():
-    trajectory = rollout().run(push_off(2), *squat())
-    with pytest.raises(ValueError, match=r"gradient w\.r\.t\. qd must be float64"):
-        rollout().backward(trajectory, qd=trajectory.q)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),  # every: 3 does not divide 8 substeps
-    [("dt", 0.0), ("dt", math.nan), ("substeps", 0), ("every", 3), ("every", 0), ("tolerance", -1.0),
-     ("tolerance", math.nan)],
-)  # fmt: skip
-def test_rollout_refuses_bad_settings(name, value):
-    with pytest.raises(ValueError, match=name):
-        Rollout(rollout().dynamics.model, **{name: value})
-
-
-def test_rollout_refuses_bad_lengths_and_worlds_to_hold():
-    of = rollout()
-    with pytest.raises(ValueError, match="geometry must be finite"):
-        of.set_geometry(np.full((4, 10), np.nan))
-    with pytest.raises(ValueError, match=r"worlds must be one bool, or \(1,\)"):
-        of.hold([True, False, True])
-
-
-def test_simulate_refuses_unknown_parameters():
-    with pytest.raises(ValueError, match="no parameter 'colour'"):
-        simulate(rollout(), torch.zeros(2, 12), *tensors(), colour=torch.zeros(1))
-
-
-@pytest.mark.parametrize("seconds", [-0.05, 5.0, float("nan")])
-def test_refuses_latency_out_of_range(seconds):
-    message = r"latency \[s\] must be in \[0, 0.1\], got "
-    of = Rollout(build_model(2, visuals=False))
-    with pytest.raises(ValueError, match=message):
-        simulate(
-            of, torch.zeros(2, 12), *(torch.as_tensor(row) for row in of.standing()), latency=torch.tensor(seconds)
-        )
-    of.parameters["latency"].fill_(seconds)
-    with pytest.raises(ValueError, match=message):
-        of.run(np.zeros((2, 12)), *of.standing())
-
-
 @pytest.mark.parametrize("seconds", [-0.05, -0.001, float("-inf"), float("nan")])
 def test_negative_latency_counts_as_zero(seconds, monkeypatch):
     """Checks of the latency are off, as on a GPU; equal worlds stay equal with any latency."""
@@ -271,55 +192,6 @@ def test_negative_latency_counts_as_zero(seconds, monkeypatch):
         np.testing.assert_array_equal(ends[1][1], ends[0][1])
     for values in ends[1]:
         np.testing.assert_array_equal(values, np.repeat(values[..., :1], 4, axis=-1))
-
-
-@pytest.mark.parametrize("name", ["targets", "q", "wrench", "kp"])
-def test_simulate_refuses_nan(name):
-    q, qd = tensors()
-    given = {"targets": torch.zeros(2, 12), "q": q, "qd": qd, "wrench": torch.zeros(2, 6), "kp": torch.ones(12)}
-    given[name] = torch.full_like(given[name], float("nan"))
-    with pytest.raises(ValueError, match=f"{name} must be finite"):
-        simulate(rollout(), **given)
-    with pytest.raises(ValueError, match="targets must be finite"):
-        rollout().run(np.full((2, 12), np.nan), *squat())
-
-
-def test_simulate_refuses_other_types():
-    q, qd = tensors()
-    with pytest.raises(ValueError, match="kp must be a torch tensor, got float"):
-        simulate(rollout(), torch.zeros(2, 12), q, qd, kp=80.0)
-    with pytest.raises(ValueError, match="q must be a torch tensor, got NoneType"):
-        simulate(rollout(), torch.zeros(2, 12), None, qd)
-    with pytest.raises(ValueError, match="impulse must be a torch tensor, got ndarray"):
-        simulate(rollout(), torch.zeros(2, 12), q, qd, impulse=np.zeros((4, 1, 3)))
-    with pytest.raises(ValueError, match="targets must be of real numbers"):
-        simulate(rollout(), torch.zeros(2, 12, dtype=torch.complex64), q, qd)
-    with pytest.raises(ValueError, match="targets must have shape"):
-        simulate(rollout(), torch.tensor(1.0), q, qd)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 3), (4, 2, 3), (4, 3)])
-def test_refuses_impulse_of_another_shape_and_casts_single_precision(shape):
-    of, (q, qd) = rollout(), tensors()
-    with pytest.raises(ValueError, match=r"impulse must have shape \(4, 1, 3\)"):
-        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(shape))
-    for other in (np.zeros((4, 1, 3)), wp.zeros(shape[:2], dtype=wp.vec3, device="cpu")):
-        with pytest.raises(ValueError, match="impulse must be an array"):
-            of.run(push_off(2), *squat(), impulse=other)
-    with pytest.raises(ValueError, match="impulse must be finite"):
-        simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.full((4, 1, 3), float("nan")))
-    single = simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(4, 1, 3, dtype=torch.float32))
-    assert torch.equal(single.q, simulate(of, torch.zeros(2, 12), q, qd).q)
-
-
-def test_backward_refuses_another_rollouts_trajectory_and_other_types():
-    trajectory = rollout().run(push_off(2), *squat())
-    with pytest.raises(ValueError, match=r"trajectory\.q must be float64 \(3, 19, 2\)"):
-        rollout(2).backward(trajectory)
-    with pytest.raises(ValueError, match=r"must be float64 of shape .*, got float32"):
-        rollout().backward(trajectory, q=wp.zeros(trajectory.q.shape, dtype=wp.float32, device="cpu"))
-    with pytest.raises(ValueError, match="got ndarray"):
-        rollout().backward(trajectory, q=np.zeros(trajectory.q.shape))
 
 
 @pytest.fixture

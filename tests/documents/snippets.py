@@ -21,11 +21,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import warp as wp
-from snippet_commands import ROOT, CommandError, Commands, command_lines
 from sybil import Sybil
 from sybil.parsers.markdown.lexers import FencedCodeBlockLexer
 
 from jumper_warp.registry import TASKS
+from snippet_commands import ROOT, CommandError, Commands, command_lines
 
 COMMENT = re.compile(r"<!--\s*(run|needs|skip|file)\b:?\s*(.*?)\s*-->")
 FILE_NAME = re.compile(r"#\s*([\w./-]+\.\w+)\s*\n")  # first line of a Python fence

@@ -4,6 +4,7 @@ import shlex
 
 import pytest
 from markdown_it import MarkdownIt
+
 from snippet_commands import ROOT, Commands
 from snippets import Page
 

@@ -1,6 +1,7 @@
 """Every snippet of docs/tutorials runs or parses."""
 
 import pytest
+
 from snippet_commands import ROOT
 from snippets import Page
 

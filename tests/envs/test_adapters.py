@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils import env_checker
-from gymnasium.wrappers.vector import NormalizeReward, RecordEpisodeStatistics
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -13,7 +12,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.vec_env import RAW_LIMIT
-from jumper_warp.gym import env_id, register_envs
+from jumper_warp.gym import env_id
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
@@ -57,13 +56,6 @@ def test_every_task_is_registered_with_gymnasium(task):
     assert spec.entry_point == "jumper_warp.gym:make_env"
 
 
-def test_registering_twice_changes_nothing():
-    before = dict(gymnasium.registry)
-    register_envs()
-    assert gymnasium.registry == before
-    assert "jumper_warp/VerticalJump-v0" in before
-
-
 def test_gymnasium_makes_the_named_task():
     envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, device="cpu", seed=7, all_groups=True)
     assert isinstance(envs, GymVectorEnv)
@@ -104,20 +96,9 @@ def test_checks_of_gymnasium_pass():
 def test_step_results_are_copies(tensors):
     envs = GymVectorEnv(jumper(), tensors=tensors)
     actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
-    obs, infos = envs.reset(seed=2)
-    results = [obs]
-    for action in actions[:13]:
-        *values, step_infos = envs.step(action)
-        results += values
-        infos = step_infos or infos
-    results += [
-        infos["_final_obs"],
-        infos["_final_info"],
-        infos["final_info"]["termination"],
-        infos["final_info"]["_termination"],
-    ]
-    results += infos["final_info"]["episode"].values()
-    results += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
+    results = [envs.reset(seed=2)[0]]
+    for *values, infos in played(envs, actions[:13]):
+        results += [*values, *(infos[name] for name in ("_final_obs", "_final_info") if name in infos)]
     copies = [value.clone() if tensors else value.copy() for value in results]
     played(envs, actions[13:])
     for value, copy in zip(results, copies, strict=True):
@@ -204,35 +185,6 @@ def test_tensors_equal_arrays():
             np.testing.assert_array_equal(infos["final_info"]["termination"], other_infos["final_info"]["termination"])
 
 
-def test_wrapper_statistics_equal_sums_over_steps():
-    plain, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
-    plain.reset()
-    envs.reset()
-    returns, lengths = np.zeros(N), np.zeros(N, dtype=int)
-    expected = []
-    for action in ACTIONS:
-        _, reward, terminated, truncated, _ = plain.step(action)
-        *_, infos = envs.step(action)
-        returns += reward
-        lengths += 1
-        ended = terminated | truncated
-        if ended.any():
-            np.testing.assert_array_equal(infos["_episode"], ended)
-            np.testing.assert_array_equal(infos["episode"]["r"], np.where(ended, returns, 0.0))
-            np.testing.assert_array_equal(infos["episode"]["l"], np.where(ended, lengths, 0))
-        expected += lengths[ended].tolist()
-        returns[ended], lengths[ended] = 0.0, 0
-    assert list(envs.length_queue) == expected and 12 in expected
-
-
-def test_wrappers_can_be_nested():
-    envs = NormalizeReward(RecordEpisodeStatistics(GymVectorEnv(jumper())))
-    obs, _ = envs.reset(seed=1)
-    assert obs in envs.observation_space
-    rewards = np.array([reward for _, reward, *_ in played(envs)])
-    assert np.isfinite(rewards).all() and rewards.std() > 0.0
-
-
 # ---------------------------------------------------------------- Gymnasium: seeds
 
 
@@ -266,68 +218,15 @@ def test_equal_seeds_reproduce_and_others_differ():
     assert (envs.reset()[0] != first).any(axis=1).all()  # without a seed the random numbers continue
 
 
-@pytest.mark.parametrize(("seed", "taken"), [(2**31 - 1, 2**31 - 1), (2**31, 0), (2**40 + 3, 3)])
-def test_large_seeds_are_accepted(seed, taken):
-    envs = GymVectorEnv(jumper(1))
-    envs.reset(seed=seed)
-    assert envs.env.seed == taken
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5])
-def test_refuses_an_invalid_seed(seed):
-    envs = GymVectorEnv(jumper(1))
-    with pytest.raises(gymnasium.error.Error, match="Seed must be"):
-        envs.reset(seed=seed)
-
-
 # ---------------------------------------------------------------- Gymnasium: refusals
 
 
-@pytest.mark.parametrize(
-    "actions",
-    [np.zeros((N, 11)), np.zeros(12), np.zeros((N + 1, 12)), np.full((N, 12), "1"), np.zeros((N, 12), dtype=complex)],
-)
+@pytest.mark.parametrize("actions", [np.zeros((N, 11)), np.full((N, 12), "1")])
 def test_refuses_invalid_actions(actions):
     envs = GymVectorEnv(jumper())
     envs.reset()
     with pytest.raises(ValueError, match=rf"actions must be numbers of shape \({N}, 12\), got "):
         envs.step(actions)
-
-
-def test_refuses_invalid_action_tensors():
-    envs = GymVectorEnv(jumper(), tensors=True)
-    envs.reset()
-    for actions in (torch.zeros(N, 11), torch.zeros(N, 12, dtype=torch.int64)):
-        with pytest.raises(ValueError, match="an action must"):
-            envs.step(actions)
-
-
-def test_accepts_integers_and_lists_as_actions():
-    envs = GymVectorEnv(jumper())
-    envs.reset()
-    for actions in (np.zeros((N, 12), dtype=int), [[0.0] * 12] * N):
-        assert envs.step(actions)[0] in envs.observation_space
-
-
-def test_refuses_calls_before_reset_and_after_close():
-    envs = GymVectorEnv(jumper())
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        envs.step(ACTIONS[0])
-    with pytest.raises(ValueError, match="reset takes no options but 'reset_mask', got 'mask'"):
-        envs.reset(options={"mask": np.ones(N, dtype=bool)})
-    envs.reset()
-    envs.close()
-    envs.close()
-    for call in (envs.reset, lambda: envs.step(ACTIONS[0])):
-        with pytest.raises(gymnasium.error.ClosedEnvironmentError):
-            call()
-
-
-def test_refuses_environments_without_auto_reset_or_of_several_tasks():
-    with pytest.raises(ValueError, match="needs an environment with auto_reset"):
-        GymVectorEnv(jumper(1, auto_reset=False))
-    with pytest.raises(ValueError, match="needs an environment of one task, this one has 2"):
-        GymVectorEnv(jumper(1, task=[TASK, dataclasses.replace(TASK, name="other")]))
 
 
 # ---------------------------------------------------------------- rsl-rl

@@ -9,9 +9,7 @@ import torch
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env, only
 from jumper_warp.envs.arrays import FIRST_STEP_COUNT
 from jumper_warp.kernels.jump.state import LANDED
-from jumper_warp.registry import make_task
 
-TASK = make_task("vertical-jump")
 N = 32
 REST = torch.zeros((N, 12))
 

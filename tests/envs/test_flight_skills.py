@@ -6,12 +6,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from columns import Z
+from experiments.flight_attitude import JUMP, OUTCOMES, TURN, FlightLog, flight_metrics
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
-from jumper_warp.utils.errors import InputError
 from metric_helpers import values
-from support.flights import JUMP, OUTCOMES, TURN, FlightLog, flight_metrics
 
 N = 4
 LATE = np.array([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.01], [0.0, 0.0]])
@@ -78,10 +77,3 @@ def test_failures_in_flight_are_counted_separately():
     flights.flight_time[1:] = 2.0
     metrics = values(flight_metrics(flights))
     assert metrics["ended_by_collided_rate"] == 0.5 and metrics["failed_before_touchdown_rate"] == 0.25
-
-
-def test_refuses_tasks_of_other_states():
-    with pytest.raises(InputError, match="needs a task with JumpState"):
-        flight_skills(make_task("attitude"), make_task("attitude"))
-    with pytest.raises(InputError, match="needs a task with AttitudeState"):
-        flight_skills(make_task("vertical-jump-mars"), make_task("velocity-flat"))

@@ -4,19 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-import tyro
 
 from columns import XY, Z
 from jump_helpers import DEG, episodes_of, make_env, only
 from jump_starts import Starts
-from jumper_warp.cli.train import parse_train
-from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.run import EvaluationArgs, conditions_of
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.utils.errors import InputError
 
 UP = 2.0  # [m/s]
 VERTICAL = dataclasses.replace(make_task("vertical-jump"), gravity=MARS)
@@ -37,16 +31,6 @@ def test_a_thrown_robot_follows_the_parabola_of_its_gravity(solver):
     for _ in range(15):  # 0.25 s
         sim.step()
     assert com() - before == pytest.approx(0.25 * UP - 0.5 * MARS * 0.25**2, abs=2e-3)
-
-
-def test_refuses_gravity_out_of_range_or_different_between_skills():
-    for bad in (-1.0, 200.0, float("nan")):
-        with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
-            Simulation(1, gravity=bad, device="cpu")
-        with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
-            Conditions(gravity=bad)
-    with pytest.raises(InputError, match=r"gravity of horizontal-jump must be 3.71 m/s\^2, got 9.81"):
-        Env((VERTICAL, make_task("horizontal-jump")), 1, device="cpu")
 
 
 def test_starts_in_flight_reach_their_apex_in_each_worlds_own_gravity():
@@ -71,11 +55,3 @@ def test_starts_in_flight_come_down_at_their_goal_on_mars():
     np.testing.assert_allclose(place[far], found.goal[far, :2], atol=2e-3)
     slope = np.arctan2(found.vel[:, Z], np.linalg.norm(found.vel[:, XY], axis=1)) / DEG
     assert slope.max() < 45.0
-
-
-def test_gravity_is_a_flag_of_trainings_evaluations_and_experiments():
-    assert parse_train(["vertical-jump", "--env.gravity", "3.71"])[0].task.gravity == MARS
-    assert tyro.cli(Conditions, args=["--gravity", "3.71"]).gravity == MARS
-    assert conditions_of(tyro.cli(EvaluationArgs, args=["--gravity", "3.71"])).gravity == MARS
-    assert Conditions(gravity=MARS).applied(make_task("velocity-flat")).gravity == MARS
-    assert Conditions().applied(VERTICAL).gravity == MARS

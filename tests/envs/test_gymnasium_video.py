@@ -1,11 +1,9 @@
 """Images and videos of Gymnasium environments."""
 
 import gymnasium
-import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers.vector import RecordVideo
 from scipy.interpolate import RegularGridInterpolator
 
 from columns import XY
@@ -15,7 +13,6 @@ from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.gym import env_id
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg, uneven
-from jumper_warp.viz import renderer
 
 SIZE = (160, 120)  # [px] width and height
 ACTIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2, 12)).astype(np.float32)
@@ -27,22 +24,6 @@ def vector(task="vertical-jump", num_envs=2, **arguments):
     return gymnasium.make_vec(env_id(task), num_envs=num_envs, **options)
 
 
-@pytest.fixture
-def envs():
-    """Return two standing robots without randomisation on level ground."""
-    envs = vector(randomize=False)
-    envs.reset(seed=1)
-    envs.env.evaluation_reset(np.array([0.0, 0.0, 0.6]))
-    yield envs
-    envs.close()
-
-
-def middle(image):
-    """Return the middle third of an image."""
-    height, width = image.shape[:2]
-    return image[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3]
-
-
 def brown(image):
     """Return the number of pixels in the color of blocks."""
     red, green, blue = image.astype(int).transpose(2, 0, 1)
@@ -50,30 +31,6 @@ def brown(image):
 
 
 # ---------------------------------------------------------------- videos
-
-
-@pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step:UserWarning")
-def test_record_video_writes_a_film_of_all_robots(tmp_path):
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
-    envs = RecordVideo(vector(), str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
-    envs.reset(seed=1)
-    for action in ACTIONS:
-        envs.step(action)
-    envs.close()
-    reader = imageio_ffmpeg.read_frames(str(tmp_path / "videos" / "rl-video-episode-0.mp4"))
-    facts = next(reader)
-    frames = [np.frombuffer(frame, np.uint8).reshape(SIZE[1], 2 * SIZE[0], 3) for frame in reader]
-    assert (facts["size"], facts["fps"], len(frames)) == ((2 * SIZE[0], SIZE[1]), 60.0, len(ACTIONS) + 1)
-    for column in (slice(0, SIZE[0]), slice(SIZE[0], None)):
-        robot = [middle(frame[:, column]).astype(float) for frame in frames]
-        assert min(image.std() for image in robot) > 30.0
-        assert np.abs(robot[-1] - robot[0]).mean() > 3.0
-
-
-def test_frame_rate_is_the_policy_rate():
-    envs = vector()
-    assert envs.metadata["render_modes"] == ["rgb_array"]
-    assert envs.metadata["render_fps"] == pytest.approx(1.0 / envs.env.step_dt)
 
 
 # ---------------------------------------------------------------- images
@@ -94,38 +51,6 @@ def test_drawing_does_not_change_the_simulation(tensors):
         states = [getattr(envs.env.sim.state, name).numpy() for envs in (drawn, plain)]
         np.testing.assert_array_equal(*states)
     drawn.close()
-
-
-def test_the_camera_follows_a_robot_over_any_distance(envs):
-    before = envs.render()[1].astype(int)
-    coordinates = envs.env.sim.joint_q().copy()
-    coordinates[1, 0] += 37.0  # [m] a whole number of periods of the drawn plane
-    envs.env.sim.state.joint_q.assign(coordinates.ravel())
-    after = envs.render()[1].astype(int)
-    assert np.abs(after - before).mean() < 0.5
-    coordinates[1, 0] += 0.2  # [m] within the dead zone
-    envs.env.sim.state.joint_q.assign(coordinates.ravel())
-    assert np.abs(envs.render()[1].astype(int) - before).mean() > 3.0
-
-
-def test_an_environment_can_draw_after_another_was_closed(envs):
-    first, third = vector(render_size=(96, 64)), vector(render_size=(96, 64))
-    for other in (first, third):
-        other.reset(seed=1)
-    images = first.render(), envs.render()
-    first.close()
-    np.testing.assert_array_equal(third.render(), images[0])
-    np.testing.assert_array_equal(envs.render(), images[1])
-    third.close()
-
-
-def test_only_the_first_worlds_are_drawn():
-    envs = vector(num_envs=3, render_envs=2)
-    envs.reset(seed=1)
-    images = envs.render()
-    assert isinstance(images, tuple) and [image.shape for image in images] == [(*SIZE[::-1], 3)] * 3
-    assert [image.any() for image in images] == [True, True, False]
-    envs.close()
 
 
 def test_each_world_shows_its_own_block_also_after_a_change():
@@ -159,48 +84,3 @@ def test_drawn_heightfield_equals_the_simulated_one(point):
     np.testing.assert_allclose(vertices[inside, 2], expected, atol=1.0e-4)
     assert inside.sum() > 1000 and np.ptp(vertices[inside, 2]) > 0.05
     assert np.isfinite(vertices).all() and np.abs(vertices[:, XY] - point).max() == pytest.approx(5.0, abs=0.1)
-
-
-def test_ray_tracer_is_used_without_opengl(envs, monkeypatch, capsys):
-    def missing(*arguments):
-        raise ImportError("no pyglet")
-
-    monkeypatch.setattr(renderer, "GLRenderer", missing)
-    images = envs.render()
-    assert min(middle(image).std() for image in images) > 30.0
-    assert capsys.readouterr().err.count("ray tracer") == 1
-
-
-# ---------------------------------------------------------------- refusals
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"render_mode": "human"}, "render_mode must be 'rgb_array' or None, got 'human'"),
-        ({"render_size": (640,)}, "render_size must be a width and a height"),
-        ({"render_size": (8, 480)}, "render_size must be a width and a height"),
-        ({"render_envs": 0}, "render_envs must be"),
-    ],
-)
-def test_refuses_invalid_render_settings(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        vector(**arguments)
-
-
-def test_drawing_without_render_mode_warns():
-    envs = vector(render_mode=None)
-    envs.reset()
-    with pytest.warns(UserWarning, match="render_mode"):
-        assert envs.render() is None
-
-
-def test_refuses_drawing_before_reset_and_after_close():
-    envs = vector()
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        envs.render()
-    envs.reset()
-    envs.render()
-    envs.close()
-    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
-        envs.render()

@@ -15,7 +15,7 @@ from jumper_warp.registry import make_task
 N = 8
 TASK = make_task("vertical-jump")
 REST = torch.zeros((N, 12))
-NAN, INF = math.nan, math.inf
+NAN = math.nan
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +40,11 @@ def assert_refused(env, message, call, *arguments):
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (torch.tensor(0.0), r"shape \(8, 12\), got \(\)"),
         (torch.zeros(12), r"shape \(8, 12\), got \(12,\)"),
-        (torch.zeros((1, 12)), r"shape \(8, 12\), got \(1, 12\)"),
-        (torch.zeros((N, 1)), r"shape \(8, 12\), got \(8, 1\)"),
-        (torch.zeros((N + 1, 12)), r"shape \(8, 12\), got \(9, 12\)"),
         (torch.zeros((12, N)), r"shape \(8, 12\), got \(12, 8\)"),
-        (torch.zeros((1, N, 12)), r"shape \(8, 12\), got \(1, 8, 12\)"),
         (torch.zeros((N, 12), dtype=torch.int64), "floating-point numbers, got torch.int64"),
-        (torch.zeros((N, 12), dtype=torch.bool), "floating-point numbers, got torch.bool"),
         (torch.zeros((N, 12), device="meta"), "on cpu, got meta"),
         (np.zeros((N, 12), dtype=np.float32), "torch tensor, got ndarray"),
-        ([[0.0] * 12] * N, "torch tensor, got list"),
-        (None, "torch tensor, got NoneType"),
     ],
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
@@ -122,36 +114,16 @@ def test_reward_terms_add_up_to_the_reward():
 
 WRONG_COMMANDS = [
     (np.zeros((3, 4)), r"x \[m\], y \[m\], height \[m\], .*, 8 rows or one for all, got shape \(3, 4\)"),
-    (np.zeros(N), r"got shape \(8,\)"),
-    (np.zeros((N, 5)), r"got shape \(8, 5\)"),
-    (np.zeros((N, 0)), r"got shape \(8, 0\)"),
-    (np.zeros((1, N, 3)), r"got shape \(1, 8, 3\)"),
-    (0.5, r"got shape \(\)"),
-    (torch.zeros((3, 3)), r"got shape \(3, 3\)"),
-    (np.full((N, 1), 0.9), r"commands of vertical-jump are x \[m\], y \[m\], height \[m\], .* got shape \(8, 1\)"),
-    (np.full((N, 2), 0.9), r"got shape \(8, 2\)"),
     (np.tile([0.0, 0.0, -5.0], (N, 1)), r"height \[m\] must be at least 0, got -5"),
     (np.tile([0.0, 0.0, 0.9, -1.0], (N, 1)), "policy step of the command .* must be at least 0, got -1"),
     (np.full((N, 3), NAN), "commands must be finite"),
-    (torch.full((N, 3), INF), "commands must be finite"),
-    ([[0.0], [0.0, 1.0]], "commands must be an array of numbers, got list"),
     ("up", "commands must be an array of numbers, got str"),
 ]
 WRONG_WORLDS = [
     (np.zeros(3, dtype=bool), r"worlds must be bool of shape \(8,\), got bool of shape \(3,\)"),
-    (np.zeros((N, 1), dtype=bool), r"got bool of shape \(8, 1\)"),
     (np.zeros(N), "got float64"),
-    (torch.zeros(N), "got float32"),
-    (np.arange(2), "got int64"),
-    (True, r"got bool of shape \(\)"),
 ]
-WRONG_HEADINGS = [
-    (np.zeros(3), r"headings must have shape \(8,\), got \(3,\)"),
-    (np.zeros((N, 1)), r"headings must have shape \(8,\), got \(8, 1\)"),
-    (NAN, "headings must be finite"),
-    (np.full(N, INF), "headings must be finite"),
-    ("north", "headings must be an array of numbers, got str"),
-]
+WRONG_HEADINGS = [(np.zeros(3), r"headings must have shape \(8,\), got \(3,\)"), (NAN, "headings must be finite")]
 
 
 @pytest.mark.parametrize(("commands", "message"), WRONG_COMMANDS)
@@ -171,15 +143,6 @@ def test_refuses_invalid_worlds(env, worlds, message):
 @pytest.mark.parametrize(("headings", "message"), WRONG_HEADINGS)
 def test_refuses_invalid_headings(env, headings, message):
     assert_refused(env, message, env.evaluation_reset, np.zeros((N, 3)), headings)
-
-
-def test_episodes_still_end_after_a_refused_evaluation(env):
-    env.reset()
-    with pytest.raises(ValueError, match="headings"):
-        env.evaluation_reset(np.zeros((N, 3)), NAN)
-    edit_episodes(env, 0, phase=LANDED, phase_steps=59)
-    env.step(REST)
-    assert env.done[0] == 1.0 and env.task_arrays()["steps"].tolist() == [0] + [1] * (N - 1)
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor, list])
@@ -263,31 +226,6 @@ def test_an_evaluation_can_start_in_some_worlds():
 # ---------------------------------------------------------------- construction
 
 
-@pytest.mark.parametrize("device", [torch.device("cpu"), "cpu"])
-def test_accepts_a_torch_device_or_its_name(device):
-    env = Env(TASK, 2, device=device)
-    env.reset()
-    env.step(torch.zeros((2, 12)))
-    assert env.device == torch.device("cpu") and env.obs.device == env.device
-
-
-@pytest.mark.parametrize(
-    ("task", "message"),
-    [
-        ("vertical-jump", "a TaskCfg, as make_task returns for a name, got 'vertical-jump'"),
-        (["vertical-jump"], "a TaskCfg, as make_task returns for a name, got 'vertical-jump'"),
-        (None, "a TaskCfg, as make_task returns for a name, got None"),
-        (make_task, "got <function make_task"),
-        ([TASK, 3], "got 3"),
-        ((), "at least one task"),
-    ],
-)
-def test_refuses_invalid_tasks(task, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        Env(task, 4)
-    assert "\n" not in str(caught.value)
-
-
 def test_the_first_step_needs_a_reset():
     env = Env(TASK, 2, device="cpu")
     with pytest.raises(RuntimeError, match="call reset before the first step"):
@@ -324,10 +262,7 @@ def test_a_changed_parameter_of_a_term_acts_in_captured_steps():
     ("name", "value", "message"),
     [
         ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
-        ("rewards.orientation.weight", 1e39, "weight must be finite, got 1e\\+39, too large for float32"),
         ("rewards.orientation.depth", 1.0, "no number 'depth' of a rewards term 'orientation'"),
-        ("rewards.levitation.weight", 1.0, "no number 'weight' of a rewards term 'levitation'"),
-        ("prizes.orientation.weight", 1.0, "no number 'weight' of a prizes term 'orientation'"),
         ("weight", 1.0, "names are like rewards.jump_height.weight"),
     ],
 )
@@ -369,10 +304,7 @@ def test_reset_of_some_worlds_changes_no_other(worlds):
     ("arguments", "message"),
     [
         ({"worlds": [0, 0]}, r"8 bools, or distinct indices below 8, got \[0, 0\]"),
-        ({"worlds": [N]}, "distinct indices below 8"),
-        ({"worlds": np.zeros(N)}, "worlds must be bool of shape"),
         ({"worlds": [0], "seed": 1}, "a seed resets all worlds"),
-        ({"seed": torch.zeros(N, dtype=torch.bool)}, "seed must be in 0"),
     ],
 )
 def test_refuses_invalid_resets_of_some_worlds(env, arguments, message):

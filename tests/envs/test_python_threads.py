@@ -1,14 +1,9 @@
 """Python threads with an environment each, and forked processes."""
 
 import itertools
-import os
-import signal
-import subprocess
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
 import torch
 
 from hold_height import hold_height
@@ -19,7 +14,6 @@ from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import MIN_WORLDS
 from jumper_warp.sim.solver import SolverJumper
-from jumper_warp.utils import threads as pool
 
 N = 2 * MIN_WORLDS
 ACTIONS = random_actions(N, 8)
@@ -75,64 +69,3 @@ def test_threads_with_an_environment_each_have_the_results_of_a_single_thread():
     assert len(found) == 24
     for i, (rows, metrics) in found:
         assert torch.equal(rows, expected[i][0]) and metrics == expected[i][1]
-
-
-FORK = """
-import os, threading
-import torch
-import warp as wp
-from hold_height import hold_height
-from jumper_warp.envs.env import Env
-
-wp.config.log_level = wp.LOG_WARNING
-torch.set_num_threads(2)
-torch.rand(500, 500) @ torch.rand(500, 500)  # torch's threads start
-
-def step(env):
-    return env.step(torch.full((32, 12), 0.1)).obs["actor"].sum().item()
-
-def work():
-    while not done:
-        step(other)
-
-env, other = (Env(hold_height(), 32, device="cpu", threads=2) for _ in range(2))
-for each in (env, other):
-    each.reset()
-    step(each), step(each)  # the second replays a graph on two threads
-done = []
-thread = threading.Thread(target=work)
-thread.start()
-child = os.fork()
-new = Env(hold_height(), 32, device="cpu", threads=2)
-new.reset()
-results = [step(each) for each in (env, env, new, new)] + [(torch.rand(500, 500) @ torch.rand(500, 500)).shape[0]]
-line = " ".join(map(str, ("parent" if child else "child", *results)))
-os.write(1, line.encode() + bytes([10]))  # at once, so that the lines of both processes stay apart
-if not child:
-    os._exit(0)
-done.append(True)
-thread.join()
-os.waitpid(child, 0)
-"""
-"""Forks while another thread steps, then steps an environment and a new one in both processes."""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_environments_work_in_a_forked_process():
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, "-c", FORK], env=env, start_new_session=True, **pipes) as process:
-        try:
-            out, err = process.communicate(timeout=120)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)  # parent and child
-            pytest.fail("a process hangs")
-    found = {words[0]: words[1:] for words in map(str.split, out.splitlines())}
-    assert found.keys() == {"parent", "child"}, err
-    assert found["parent"] == found["child"] and len(found["child"]) == 5
-
-
-def test_a_forked_process_whose_parent_used_cuda_is_refused_in_one_line(monkeypatch):
-    monkeypatch.setattr(pool.WARP_LOCK, "_forked", True)
-    with pytest.raises(RuntimeError, match=r"cannot use CUDA: start it with multiprocessing.get_context\('spawn'\)$"):
-        Simulation(1, device="cpu")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from ground_helpers import hardest
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.mdp.attempts import LANES
 from jumper_warp.registry import make_task
-from support.soak import hardest
 
 N = 96
 

@@ -49,21 +49,6 @@ def test_start_states_and_observation_noise_differ_by_purpose():
     assert not torch.isclose(one.reset()[0]["actor"], other.reset()[0]["actor"], rtol=0.0, atol=1e-6).all(dim=1).any()
 
 
-def test_training_keeps_its_robots_start_states_and_noise():
-    """The literals were computed without purposes of streams; observations contain start states and noise."""
-    jump, walk = (Env(make_task(name), 3, seed=5, device="cpu") for name in ("vertical-jump", "velocity-flat"))
-    for env in (jump, walk):
-        env.reset()
-        np.testing.assert_allclose(
-            env.parameters.body_mass.numpy()[:4], [6.362653, 1.705438, 0.07959156, 0.19653516], 1e-6
-        )
-    assert jump.parameters.latency.numpy().tolist() == [3, 0, 7]
-    np.testing.assert_allclose(jump.parameters.static_ratio.numpy(), [1.2635862, 1.2122867, 1.2541593], 1e-6)
-    assert walk.parameters.latency.numpy().tolist() == [5, 0, 15]
-    assert walk.parameters.observation_latency.numpy().tolist() == [2, 14, 4]
-    np.testing.assert_allclose(walk.obs[0, :4], [0.16874886, 0.72030157, 0.05287981, 0.45732203], 1e-5)
-
-
 def test_no_two_pairs_of_purpose_and_seed_have_the_same_seed():
     """The smallest and the largest seeds of purposes follow one another."""
     ends = [(purpose_seed(name, 0), purpose_seed(name, MOST_SEED)) for name in PURPOSES]
@@ -71,12 +56,3 @@ def test_no_two_pairs_of_purpose_and_seed_have_the_same_seed():
     assert all(last + 1 == first for (_, last), (first, _) in itertools.pairwise(ends))
     with pytest.raises(InputError, match="seed must be in 0"):
         purpose_seed("tuning", 2**31)
-
-
-def test_refuses_an_unknown_stream_and_a_state_of_another_one():
-    task = make_task("vertical-jump")
-    with pytest.raises(InputError, match="stream must be one of training, tuning, selection, reporting, got 'test'"):
-        Env(task, 2, device="cpu", stream="test")
-    saved, other = (randomized(OFF, 2, stream=name) for name in ("tuning", "reporting"))
-    with pytest.raises(InputError, match="saved with seed 2147483648, this environment has seed 6442450944"):
-        other.load_state_dict(saved.state_dict())

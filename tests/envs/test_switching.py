@@ -1,7 +1,5 @@
 """Handovers between the shipped policies on one robot: their order, and the state after them."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.courses import SQUAT_TIME, CourseLog
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
+from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.overlay import RobotOverlay
 
@@ -22,8 +20,6 @@ SCRIPTS = [
     parse_script([{"stand": 0.4}, {"jump_to": [0.7, 0.0]}, {"walk": [0.0, 0.3, 0.0], "seconds": 0.5}, {"jump_up": 0.6},
                   {"stand": 0.2}]),
 ]  # fmt: skip
-
-HANDOVERS = "jumper_warp.kernels.skills.handovers"
 
 
 def coordinates(env) -> np.ndarray:
@@ -116,29 +112,6 @@ def test_jumps_are_commanded_squat_time_after_the_handover_and_walking_starts_st
     first = switches[[s.target for s in switches].index(JUMP_TO)]
     way = first.state["goal"][:2] - first.after[:2]
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)
-
-
-def test_refuses_policies_of_other_tasks():
-    with pytest.raises(PolicyError, match=r"suite velocity, got one of task vertical-jump"):
-        SkillPolicies(SkillNames(walk="vertical_jump"))
-    with pytest.raises(PolicyError, match=r"suite landing_position or omnidirectional, got one of task velocity-flat"):
-        SkillPolicies(SkillNames(jump_to="walking_flat"))
-
-
-def test_configuration_names_all_tasks_and_handovers(followed):
-    policies, env, _, _ = followed
-    config = env.config()
-    assert [task["name"] for task in config["tasks"]] == [task.name for task in policies.skills]
-    assert config["handovers"][0] == {
-        "source": "velocity-flat", "target": "vertical-jump",
-        "when": f"{HANDOVERS}:walk_to_jump_due", "begin": f"{HANDOVERS}:begin_jump",
-    }  # fmt: skip
-    assert len(config["handovers"]) == 4 and "tasks" not in Env(env.tasks[0], 1, device="cpu").config()
-    assert dataclasses.asdict(policies.names) == {
-        "walk": "walking_flat",
-        "jump_up": "vertical_jump",
-        "jump_to": "horizontal_jump",
-    }
 
 
 # ---------------------------------------------------------------- robot overlays

@@ -1,7 +1,6 @@
 """CPU threads: results do not depend on their number bitwise, and errors reach the caller."""
 
 import dataclasses
-import os
 import threading
 import time
 from functools import partial
@@ -13,7 +12,6 @@ import warp as wp
 
 import hold_height
 from jump_helpers import random_actions
-from jumper_warp.cli.main import main
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
@@ -27,7 +25,6 @@ from jumper_warp.sim.slices import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
-from jumper_warp.utils.errors import InputError
 from skill_helpers import begin_hold, begin_jump, jump_requested
 
 N = 3 * MIN_WORLDS + 2
@@ -169,18 +166,7 @@ def test_slices_contain_each_world_once_and_are_about_equal(worlds, threads):
     assert worlds >= 2 * MIN_WORLDS or slices == [WorldRange(0, worlds)]
 
 
-def test_mujoco_has_one_slice():
-    assert Simulation(2 * MIN_WORLDS, solver="mujoco", visuals=False, device="cpu", threads=2).slices == [
-        (0, 2 * MIN_WORLDS)
-    ]
-
-
 # ---------------------------------------------------------------- threads
-
-
-def test_jobs_run_at_the_same_time():
-    barrier = threading.Barrier(3, timeout=30.0)
-    pool.run_in_parallel([barrier.wait] * 3, 3)
 
 
 def test_each_job_runs_once_whatever_the_number_of_threads():
@@ -210,40 +196,3 @@ def test_the_exception_of_a_job_is_raised_after_all_started_jobs_have_ended(fail
     assert ended == [True]
     pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads still run
     assert len(ended) == 3
-
-
-def test_a_step_raises_the_exception_of_a_slice():
-    env = Env(JUMP, 2 * MIN_WORLDS, device="cpu", threads=2)
-    env.reset()
-    env.step(torch.zeros(2 * MIN_WORLDS, 12))
-    (graph,) = env._graphs.values()
-    graph._graphs[1].apic_state = object()  # not the state of a graph
-    with pytest.raises(Exception, match="argument"):
-        env.step(torch.zeros(2 * MIN_WORLDS, 12))
-
-
-def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)))
-    assert pool.checked_threads(None) == 6
-    for processes, threads in (("2", 3), ("4", 1), ("16", 1)):
-        monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
-        assert pool.checked_threads(None) == threads
-    pool.set_threads(5)
-    assert pool.checked_threads(None) == 5 and pool.checked_threads(2) == 2
-
-
-@pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
-def test_refuses_an_invalid_number_of_threads(threads):
-    message = "threads must be a whole number of 1 to 1024, got"
-    for use in (pool.set_threads, lambda n: TrainCfg(threads=n), lambda n: Simulation(1, device="cpu", threads=n)):
-        with pytest.raises(InputError, match=message):
-            use(threads)
-
-
-@pytest.mark.parametrize("command", [["train", "vertical-jump"], ["evaluate", "vertical_jump"]])
-def test_a_command_refuses_bad_threads_in_one_line(command, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([*command, "--threads", "0"])
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert caught.value.code == 2
-    assert lines == ["jumper: threads must be a whole number of 1 to 1024, got 0"]

@@ -13,8 +13,6 @@ from jumper_warp.kernels.collision.robot import SHANK_GROUND
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.terms import StateMetric
-from jumper_warp.utils.errors import InputError
 from velocity_helpers import edit, states_of, walking_env
 
 N = 32
@@ -134,18 +132,6 @@ def test_metrics_are_ratios_of_sums_over_worlds(flat):
     assert "Metrics/error_of_successes_m_s" in metrics
     again = flat.metrics()
     assert again["Metrics/error_vel_xy_settled_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
-
-
-@pytest.mark.parametrize(
-    ("name", "key"), [("speed_m_s", "Metrics/speed_m_s"), ("Curriculum/level", "Curriculum/level")]
-)
-def test_metric_without_a_group_is_logged_in_the_group_metrics(name, key):
-    assert StateMetric(name, "score").name == key
-
-
-def test_refuses_a_metric_of_an_unknown_field():
-    with pytest.raises(InputError, match="metric Metrics/x needs a field 'speed' of the state"):
-        dataclasses.replace(make_task("velocity-flat"), metrics=(StateMetric("Metrics/x", "speed"),))
 
 
 def test_episode_and_command_end_at_their_own_times(flat):

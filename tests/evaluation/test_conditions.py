@@ -8,7 +8,7 @@ import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
 from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_text, latency_values
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import save_policy
@@ -17,7 +17,6 @@ from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg
 from landing_helpers import still_policy
 
-DT = 1.0 / 480.0  # [s] Physics step
 JUMP = make_task("horizontal-jump")
 HELD = dataclasses.replace(
     JUMP,
@@ -156,30 +155,14 @@ def test_randomised_conditions_keep_fixed_parameters():
     ("make", "message"),
     [
         (lambda: Conditions(latency=101.0), "latency must be in 0 to 100 ms"),
-        (
-            lambda: Conditions(latency=0.008),
-            r"latency must be 0 or at least 1\.04 ms, half a physics step, got 0\.008 ms",
-        ),
-        (lambda: Conditions(seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
-        (lambda: EvaluationArgs(latency=-1.0), "latency must be in 0 to 100 ms, got -1"),
         (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
-        (lambda: EvaluationArgs(gain_scale=(1.0, -1.0)), "damping_gains must be in 0 to 10, got -1"),
         (lambda: Conditions(friction=-0.1), "friction must be in 0 to 10, got -0.1"),
-        (lambda: Conditions(sensor_offset=-1.0), r"joint_offset must rise, got \(1\.0, -1\.0\)"),
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
 )
 def test_refuses_invalid_conditions(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_latency_text_rounds_to_physics_steps():
-    assert latency_text(np.array([4, 4]), DT) == "8.33 ms (4 physics steps)"
-    assert latency_text(np.array([1]), DT) == "2.08 ms (1 physics step)"
-    assert latency_text(np.array([0, 8, 4]), DT) == "0 to 16.7 ms (0 to 8 physics steps), mean 8.33 ms"
-    assert latency_values(np.array([3, 3]), DT) == {"latency_ms": 6.25, "latency": "6.25 ms (3 physics steps)"}
-    assert latency_values(np.array([4]), DT, 8.0)["latency_requested_ms"] == 8.0
 
 
 def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):

@@ -8,7 +8,6 @@ import pytest
 from jumper_warp.evaluation.courses import JUMP_TIMEOUT, SLEW_RATE, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
-from jumper_warp.utils.errors import InputError
 from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step
@@ -171,11 +170,6 @@ def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
     before = course.switch_step[0, 1] - 1
     expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
     np.testing.assert_allclose(course.marks()["goals"][0], expected)
-
-
-def test_refuses_scripts_of_different_lengths():
-    with pytest.raises(InputError, match="equal, positive lengths"):
-        CourseLog([SCRIPT, SCRIPT[:1]])
 
 
 def test_series_and_columns_report_robot_state():

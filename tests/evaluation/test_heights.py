@@ -97,16 +97,6 @@ def test_unfinished_jump_fails_with_no_end_and_without_landing_metrics():
     assert metrics["landing_tilt_max_deg"] is None
 
 
-def test_columns_have_one_row_per_jump_and_none_for_nan():
-    jumps = JumpLog(np.array([0.5, 0.8]), ("success", "diverged"))
-    landed = {"phase": [2, 0], "phase_steps": [60, 0]}
-    fly(jumps, [0.52, np.nan])
-    jumps.update(make_arrays(jumps, termination=[0, 1], **landed), 1.0 / 60.0)
-    columns = jumps.columns()
-    assert (columns["goal_height_m"], columns["outcome"]) == ([0.5, 0.8], ["success", "diverged"])
-    assert columns["apex_error_m"] == [pytest.approx(0.02), None] and columns["landed"] == [True, False]
-
-
 def test_jump_that_takes_off_before_command_can_be_seen_is_early():
     jumps = JumpLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged"))
     for step, took_off in ((29, [0, 1, 0]), (30, [0, 0, 1]), (31, [1, 0, 0])):

@@ -327,26 +327,6 @@ def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():
     assert landings.marks()["goals"][0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
 
-def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
-    landings, _ = two_in_a_row()
-    columns = landings.columns()
-    assert all(len(values) == 4 for values in columns.values())
-    assert columns["goal_x_m"] == [0.8, 0.7, 0.8, 0.7]
-    assert columns["distance_at_end_m"][3] is None and columns["outcome"][3] == "not_begun"
-    assert landings.named(landings.series(), [1])["distance/to goal, (0.80, 0.20) m [m]"] == pytest.approx(0.05)
-
-
-def test_worlds_with_the_same_goal_have_distinct_names_in_series_and_states():
-    landings, _ = two_in_a_row()
-    assert landings.labels([0, 1]) == ["(0.80, 0.20) m"] * 2
-    assert landings.names([0, 1]) == ["(0.80, 0.20) m, jump 1", "(0.80, 0.20) m, jump 2"]
-    assert len(landings.named(landings.series(), [0, 1])) == 2 * len(landings.series())
-    assert list(landings.named(landings.states(), [0, 1])) == [
-        "phase/(0.80, 0.20) m, jump 1",
-        "phase/(0.80, 0.20) m, jump 2",
-    ]
-
-
 def test_landing_evaluation_excludes_shaping_terminations():
     terms = with_jump_terminations(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms] == ["diverged", "low_base", "collided", "no_jump", "success"]
@@ -366,15 +346,6 @@ def test_command_delay_may_differ_between_worlds():
     env = StubEnv(2)
     JumpLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
     assert env.command_step.tolist() == [30.0, 15.0]  # policy steps
-
-
-def test_maximum_time_grows_with_number_of_jumps():  # 1 + 2 * (3.5 + rest 1) + delay 0.5
-    assert JumpLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
-
-
-def test_refuses_goals_of_wrong_shape():
-    with pytest.raises(ValueError, match="goals must have shape"):
-        JumpLog(np.zeros((3, 2)), TERMINATIONS)
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.5, 0.0, 2.0])

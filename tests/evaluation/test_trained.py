@@ -1,6 +1,5 @@
 """Warnings about commands beyond the range of a training."""
 
-import numpy as np
 import pytest
 
 from jumper_warp.evaluation.courses import CourseLog
@@ -9,7 +8,6 @@ from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.evaluation.trained import trained_success, warn_beyond_training
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
 from jumper_warp.registry import make_task
-from jumper_warp.utils.metrics import format_value
 
 
 @pytest.mark.parametrize(
@@ -26,17 +24,6 @@ def test_command_beyond_the_training_is_named_in_one_line(task, flags, words, ca
     warn_beyond_training(make_task(task), flags.log(make_task(task)).all_commands())
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"jumper: beyond the training of {task}: {words}")
-
-
-@pytest.mark.parametrize(
-    ("task", "flags"),
-    [("velocity-flat", VelocityPlayFlags()), ("vertical-jump", HeightPlayFlags()),
-     ("horizontal-jump", LandingPlayFlags()), ("horizontal-jump", LandingPlayFlags(goal=((0.5, 0.0),)))],
-)  # fmt: skip
-def test_trained_commands_print_nothing(task, flags, capsys):
-    warn_beyond_training(make_task(task), flags.log(make_task(task)).all_commands())
-    warn_beyond_training(make_task("attitude"), np.full((1, 3), 9.0))
-    assert capsys.readouterr().err == ""
 
 
 def test_commands_of_a_script_are_compared_with_the_training_of_their_skill(capsys):
@@ -60,7 +47,3 @@ def test_success_is_counted_within_and_beyond_the_training():
     }
     assert not trained_success(task, HeightPlayFlags((0.5, 0.9)).log(task))  # nothing to compare
     assert not trained_success(make_task("attitude"), log)  # no range of goals
-
-
-def test_undefined_values_are_not_printed_as_none():
-    assert format_value([1.5, None]) == "1.5, undefined" and format_value(None) == "undefined"

@@ -4,8 +4,6 @@ import pytest
 
 from experiments import attitude, flight_attitude
 from jumper_warp.cli.main import main as cli
-from jumper_warp.policies.spec import PolicyError
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,18 +53,3 @@ def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
     assert values["apex_mean_m"] == pytest.approx(1.75, abs=0.2) and "late_ms" not in values
     assert values["angular_momentum_change_in_flight_max_nm_s"] < 1.0e-4
     assert 0.0 < held["touchdown_turn_mean_deg"] <= held["touchdown_turn_max_deg"] < 20.0
-
-
-def test_refuses_invalid_flags_and_policies_of_other_tasks(tmp_path):
-    with pytest.raises(InputError, match="num_turns must be at least 6"):
-        attitude.Args(num_turns=3)
-    with pytest.raises(InputError, match="max_leg_delay in 0 to 100 ms"):
-        flight_attitude.Args(max_leg_delay=200.0)
-    with pytest.raises(InputError, match="takeoff by a policy needs one"):
-        flight_attitude.Args(takeoff="policy")
-    with pytest.raises(InputError, match="height_range must be in"):
-        flight_attitude.Args(height_range=(2.0, 1.0))
-    with pytest.raises(PolicyError, match="suite attitude"):
-        attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
-    with pytest.raises(PolicyError, match="needs a policy that turns in flight"):
-        flight_attitude.main(flight_attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

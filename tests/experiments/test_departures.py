@@ -9,6 +9,7 @@ import pytest
 
 from columns import Z
 from experiments import departures
+from experiments.departures import DEPARTURES, ablation_flags, parse, train_or_load
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
@@ -18,9 +19,6 @@ from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
-from support import departure_runs
-from support.departure_runs import parse, train_or_load
-from support.departures import DEPARTURES, ablation_flags
 
 
 def train_settings(task, name):
@@ -109,10 +107,10 @@ def test_trainings_are_cached_evaluated_with_task_terminations_and_refuse_other_
     assert not (tmp_path / "metrics.json").exists()
     config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
     assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
-    ends, run_episodes = [], departure_runs.EvaluationRun.run_episodes
-    monkeypatch.setattr(departure_runs, "train", None)
+    ends, run_episodes = [], departures.EvaluationRun.run_episodes
+    monkeypatch.setattr(departures, "train", None)
     monkeypatch.setattr(
-        departure_runs.EvaluationRun, "run_episodes",
+        departures.EvaluationRun, "run_episodes",
         lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or run_episodes(run, env, log),
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
@@ -142,13 +140,3 @@ def test_baseline_is_trained_with_baseline_seeds():
     flags = [(name, seed, ablation) for name, seed, ablation in args.trainings()]
     assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]
     assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])
-
-
-def test_refuses_invalid_flags_before_training(tmp_path):
-    with pytest.raises(InputError, match="not bracing"):
-        departures.Args(only=("bracing",))
-    with pytest.raises(InputError, match="at least 1"):
-        departures.Args(iterations=0)
-    with pytest.raises(SystemExit):  # with tyro's message
-        departures.main(departures.Args(train_flags="--no-such-flag 1", out=tmp_path / "none"))
-    assert not (tmp_path / "none").exists()

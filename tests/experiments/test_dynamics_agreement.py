@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from experiments import dynamics_agreement
+from experiments.dynamics_agreement import jumper_quantities, pinocchio_quantities, random_states
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.output import read_values
-from support.agreement import jumper_quantities, pinocchio_quantities, random_states
 
 OVERLAY = RobotOverlay(
     {

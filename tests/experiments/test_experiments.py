@@ -1,13 +1,33 @@
-import dataclasses
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, new_reward, soak_test
+from experiments import (
+    attitude,
+    benchmark_solver,
+    benchmark_training,
+    departures,
+    flight_attitude,
+    gradient_cost,
+    identification_starts,
+    learning_curves,
+    leg_springs,
+    measure_policies,
+    new_reward,
+    open_loop_jump,
+    paper_trainings,
+    soak_test,
+    squat_hold,
+    template,
+    trajectory_optimization,
+    walk_jump_walk,
+    walking_terrain,
+    walking_tracking,
+)
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
@@ -15,14 +35,13 @@ from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.registry import make_task
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
-from landing_helpers import OPEN_LOOP_APEX, still_policy
+from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
 from metric_helpers import values
 from support.learning import LearningCurve, run_jumps
-from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
 
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
@@ -47,6 +66,15 @@ def test_new_reward_is_logged_by_name(trained):
     assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
     assert values["episode_reward_even_load"] > 0.0
     assert read_values(folder)["iterations"] == 2
+
+
+def test_template_measures_the_landing_error_over_friction(tmp_path):
+    args = template.Args(frictions=(0.3, 0.8), num_jumps=2, out=tmp_path, device="cpu")
+    values = template.main(args)
+    slippery, nominal = (values[f"friction_{x}_goal_distance_at_end_mean_m"] for x in (0.3, 0.8))
+    assert nominal < 0.05 < slippery
+    for name in ("metrics.json", "friction.png", "friction_0.3.rrd", "friction_0.8.png"):
+        assert (tmp_path / name).stat().st_size > 1000, name
 
 
 # ---------------------------------------------------------------- the sweep
@@ -116,19 +144,6 @@ def test_diverged_world_is_a_failure_excluded_from_errors():
     assert metrics["apex_max_m"] == pytest.approx(0.65)
 
 
-class OpenLoopPolicy:
-    """Policy that from policy step `begin` on squats for 60 steps and then extends the legs for 20 steps."""
-
-    def __init__(self, begin):
-        self.begin, self.step = begin, 0
-
-    def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
-        elapsed = self.step - self.begin
-        self.step += 1
-        level = 0.0 if elapsed < 0 else min(elapsed / 25, 1.0) if elapsed < 60 else -1.0 if elapsed < 80 else 0.0
-        return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
-
-
 @pytest.fixture(scope="module")
 def sweep_env():
     """Return an environment of three nominal robots with the terminations of the sweep."""
@@ -169,7 +184,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_p
 # ---------------------------------------------------------------- learning curves
 
 
-def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variants(tmp_path, monkeypatch):
+def test_learning_curves_report_time_to_success_rates(tmp_path, monkeypatch):
     def train(args, name, seed):
         if seed == 1:
             return LearningCurve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
@@ -189,8 +204,6 @@ def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variant
     assert values["seconds_to_100_percent_eager_1"] is None
     assert values["history"] == 1 and values["goals_m"] == [0.5, 0.9]
     assert (tmp_path / "learning_curves.png").is_file()
-    with pytest.raises(InputError, match=r"variants are default, .*, got 'faster'"):
-        replace(args, variants=("faster",))
 
 
 # ---------------------------------------------------------------- benchmark
@@ -213,76 +226,50 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
 
 
-def test_soak_of_simulation_and_environment_reports_no_invalid_worlds(tmp_path):
-    for task in (None, "horizontal-jump"):
-        args = SoakArgs(num_envs=8, steps=40, episode_steps=20, task=task, out=tmp_path, device="cpu")
-        values = soak_test.main(args)
-        saved = read_values(tmp_path)
-        assert saved == values | {"envs": 8, "filter": False, "seed": 0}
-        assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
-        assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
-
-
-def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):  # 4 worlds diverge in each of 5 steps
+def test_soak_counts_diverged_worlds_and_refuses_values_that_are_not_finite(tmp_path, monkeypatch):
+    args = soak_test.Args(num_envs=4, steps=5, hold_steps=5, tasks=("vertical-jump",), out=tmp_path, device="cpu")
+    values = soak_test.main(args)
+    assert values == read_values(tmp_path) and (values["steps"], values["non_finite_worlds"]) == (20, 0)
+    assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
     step = Env.step
     monkeypatch.setattr(Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    args = SoakArgs(
-        num_envs=4, steps=5, hold_steps=5, episode_steps=100, task="vertical-jump", out=tmp_path, device="cpu"
-    )
-    assert soak_test.main(args)["non_finite_worlds"] == 20
-
-
-def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
-    step = Env.step
+    assert soak_test.main(args)["non_finite_worlds"] == 20  # all worlds in each step
 
     def step_with_nan(env, action):
         step(env, action)
         env.reward[2] = torch.nan
 
     monkeypatch.setattr(Env, "step", step_with_nan)
-    args = SoakArgs(num_envs=4, steps=40, episode_steps=20, task="vertical-jump", out=tmp_path, device="cpu")
-    with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
+    with pytest.raises(RuntimeError, match="5 rows hold values that are not finite, by step 5"):
         soak_test.main(args)
 
 
-def test_hardest_keeps_only_last_terrain_row_and_tasks_without_terrain():
-    terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
-    assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
-    for name in ("velocity-flat", "vertical-jump"):
-        assert hardest(make_task(name)) == make_task(name)
+@dataclass
+class Flags:
+    """Flags of a script."""
+
+    envs: tuple
+    noise: bool
+    baseline: Path | None = None
+    out: Path | None = None
+    device: str | None = None
+    newest: int = 3
 
 
-def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates(tmp_path):
-    script = tmp_path / "base" / "experiments" / "script.py"
-    script.parent.mkdir(parents=True)
-    script.write_text(
+def test_baseline_ratios_compare_rates_with_those_of_another_checkout_with_the_same_flags(tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/script.py").write_text(
         "import sys\n"
         "assert sys.argv[1:6] == ['--envs', '4', '8', '--no-noise', '--out'], sys.argv\n"
         "from pathlib import Path\n"
         "from jumper_warp.utils.output import write_metrics\n"
         "write_metrics(Path(sys.argv[6]), {'steps_per_s_jump': 50.0, 'apex_m': 1.0})"
     )
-
-    @dataclass
-    class Args:  # flags of the script
-        envs: tuple
-        noise: bool
-        baseline: Path
-        out: Path | None = None
-        device: str | None = None
-        newest: int = 3
-
     metrics = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
-    args = Args((4, 8), False, tmp_path / "base")
-    ratios = baseline_ratios(args.baseline, "experiments/script.py", args, metrics)
-    assert ratios == {"steps_per_s_jump_over_baseline": 2.0}
-    assert baseline_ratios(None, "experiments/script.py", args, metrics) == {}
-    with pytest.raises(InputError, match=r"fails: .*AssertionError"):
-        baseline_ratios(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), metrics)
-    with pytest.raises(InputError, match=r"no experiments/other\.py in"):
-        baseline_ratios(args.baseline, "experiments/other.py", args, metrics)
-    assert changed_flags(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
-    assert changed_flags(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
+    flags = Flags((4, 8), False, tmp_path)
+    assert baseline_ratios(tmp_path, "experiments/script.py", flags, metrics) == {"steps_per_s_jump_over_baseline": 2.0}
+    assert baseline_ratios(None, "experiments/script.py", flags, metrics) == {}
+    assert changed_flags(Flags((4,), True, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
 
 
 def test_solver_benchmark_reports_both_solvers_and_ratio(tmp_path):
@@ -316,3 +303,40 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     assert values["cpu_ratio"] == pytest.approx(expected)
     for name in ("targets", "q", "qd", "table", "saturation"):
         assert 0.0 < values[f"error_{name}"] < 0.02
+
+
+@pytest.mark.parametrize(
+    ("kind", "flags", "message"),
+    [
+        (attitude.Args, {"num_turns": 3}, "num_turns must be at least 6"),
+        (departures.Args, {"only": ("bracing",)}, "not bracing"),
+        (departures.Args, {"iterations": 0}, "at least 1"),
+        (flight_attitude.Args, {"takeoff": "policy"}, "takeoff by a policy needs one"),
+        (flight_attitude.Args, {"height_range": (2.0, 1.0)}, "height_range must be in"),
+        (identification_starts.Args, {"shard": "3/2"}, "shard must be K/N"),
+        (learning_curves.Args, {"variants": ("faster",)}, "variants are default, .*, got 'faster'"),
+        (leg_springs.Args, {"stiffness": (-1.0,)}, "spring_stiffness must be in"),
+        (measure_policies.Args, {"policies": ("high_jump",)}, "no 'high_jump'; there are attitude"),
+        (open_loop_jump.Args, {"robot": Path("heavy.json"), "spring": (1000.0, 0.17)}, "springs or a robot"),
+        (paper_trainings.Args, {"arms": ("no_rewards",)}, "not no_rewards"),
+        (squat_hold.Args, {"height": (1.0, 0.5)}, "height must be in"),
+        (trajectory_optimization.Args, {"jumps": ("wings",)}, "no jump 'wings'"),
+        (walk_jump_walk.Args, {"num_robots": 0}, "robots"),
+        (walking_terrain.Args, {"speed": 0.9}, "speed"),
+        (walking_tracking.Args, {"commands_per_axis": 1}, "commands_per_axis"),
+    ],
+)
+def test_refuses_invalid_flags(kind, flags, message):
+    with pytest.raises(InputError, match=message):
+        kind(**flags)
+
+
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [(attitude, "AttitudeEvaluation"), (flight_attitude, "needs a policy that turns"),
+     (walk_jump_walk, "VelocityEvaluation"), (walking_tracking, "VelocityEvaluation")],
+)  # fmt: skip
+def test_refuses_policy_of_another_task(script, message, tmp_path):
+    policy = "horizontal_jump" if script is flight_attitude else "vertical_jump"
+    with pytest.raises(PolicyError, match=message):
+        script.main(script.Args(policy=policy, out=tmp_path, device="cpu"))

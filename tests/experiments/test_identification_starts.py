@@ -6,9 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.identification_starts import Args, saved_fits, summary
-from experiments.support.far_robots import bad_probability
-from jumper_warp.utils.errors import InputError
+from experiments.identification_starts import bad_probability, saved_fits, summary
 from jumper_warp.utils.output import read_values, write_metrics
 
 
@@ -49,9 +47,3 @@ def test_line_that_was_cut_off_is_computed_again(tmp_path):
     assert saved_fits(path) == {}
     path.write_text(f"{line}\n{line[:40]}")
     assert list(saved_fits(path)) == [(0, 0)]
-
-
-@pytest.mark.parametrize("shard", ["0/2", "3/2", "1", "a/b"])
-def test_shard_out_of_range_is_refused(shard):
-    with pytest.raises(InputError, match="shard must be K/N"):
-        Args(shard=shard)

@@ -1,12 +1,8 @@
 """Experiment with springs between the knees at a tiny size."""
 
-from pathlib import Path
-
 import pytest
 
 from experiments import leg_springs
-from jumper_warp.robot.overlay import load_overlay
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 
 
@@ -18,15 +14,3 @@ def test_springs_raise_apex_and_highest_jump_is_recorded(tmp_path):
     assert without == pytest.approx(1.075, abs=0.01) and with_springs == pytest.approx(1.243, abs=0.01)
     assert values["stock_highest_apex_height_m"] == pytest.approx(with_springs, abs=0.005)
     assert (tmp_path / "springs.png").is_file() and (tmp_path / "jump_stock.rrd").stat().st_size > 10_000
-
-
-def test_leg_springs_overlay_has_sequel_values():
-    values = load_overlay(Path(__file__).parents[2] / "assets/jumper/leg_springs.json").values
-    assert values == {"spring_stiffness": (1000.0,), "spring_length": (0.17,)}
-
-
-def test_refuses_invalid_flags():
-    with pytest.raises(InputError, match="spring_stiffness must be in"):
-        leg_springs.Args(stiffness=(-1.0,))
-    with pytest.raises(InputError, match="at least one"):
-        leg_springs.Args(squat_angles=())

@@ -7,7 +7,6 @@ from experiments import open_loop_jump
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from support.open_loop import simulate_jump
 
@@ -43,8 +42,3 @@ def test_recorded_paw_forces_are_the_peaks_of_the_trace():
     peaks = np.linalg.norm(trace.force, axis=2).reshape(-1, sim.substeps, 4).max(axis=1)
     np.testing.assert_allclose(np.linalg.norm(shown.contact_forces[:, 0], axis=2), peaks, rtol=1e-5)
     np.testing.assert_allclose(shown.series["peak paw force/FL [N]"], peaks[:, 0], rtol=1e-5)
-
-
-def test_refuses_springs_together_with_robot(tmp_path):
-    with pytest.raises(InputError, match="springs or a robot"):
-        open_loop_jump.Args(robot=tmp_path / "heavy.json", spring=(1000.0, 0.17))

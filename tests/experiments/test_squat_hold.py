@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from experiments import squat_hold
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from metric_helpers import values
 from support.squats import SquatLog, squat_metrics
@@ -52,10 +51,3 @@ def test_shipped_policies_hold_their_squats(policy, tmp_path):
     assert saved["holding_rate"] == 1.0 and saved["lost_paw_share_mean"] == 0.0
     assert 0.0 < saved["paw_force_range_max_n"] < 1.0
     assert (tmp_path / "hold.png").is_file()
-
-
-def test_refuses_invalid_flags():
-    with pytest.raises(InputError, match="need at least one squat"):
-        squat_hold.Args(hold_time=0.5)
-    with pytest.raises(InputError, match="height must be in"):
-        squat_hold.Args(height=(1.0, 0.5))

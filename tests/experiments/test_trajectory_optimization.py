@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from experiments import trajectory_optimization as experiment
-from jumper_warp.cli.main import run_command
+from experiments.trajectory_optimization import JUMPS, LIMITED, run_ups
 from jumper_warp.trajectory.smoothing import penalised
-from support.optimized_jumps import JUMPS, LIMITED, run_ups
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -75,10 +74,3 @@ def test_run_ups_vary_lean_back_and_take_off():
     back = -motion.q[:30, :, 0].amin(0).numpy()
     assert np.median(back) > 0.1
     assert motion.takeoff(0.25)[1].float().mean() > 0.5
-
-
-@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"final_iterations": 0}])
-def test_invalid_flags_give_one_line_error(flags, capsys):
-    with pytest.raises(SystemExit):
-        run_command(lambda: experiment.Args(**flags))
-    assert capsys.readouterr().err.count("\n") == 1

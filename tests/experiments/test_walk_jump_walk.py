@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from experiments import walk_jump_walk
-from jumper_warp.policies.spec import PolicyError
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -39,10 +37,3 @@ def test_scripts_have_specified_commands_and_are_reproducible():
         assert all(np.abs(step.values).max() <= 0.8 for step in script if step.kind == "walk")
     args = walk_jump_walk.Args(num_robots=3, course=True, seed=5)
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
-
-
-def test_refuses_invalid_flags_and_policy_of_other_task(tmp_path):
-    with pytest.raises(InputError, match="robots"):
-        walk_jump_walk.Args(num_robots=0)
-    with pytest.raises(PolicyError, match="suite velocity"):
-        walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

@@ -5,12 +5,9 @@ import pytest
 
 from experiments import walking_terrain, walking_tracking
 from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy
-from support.walks import kicked_walks, sped_up_walks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -55,22 +52,11 @@ def test_kicked_and_sped_up_walks_have_specified_kicks_and_speeds():
     class Env:  # stub with the attributes that the walks read
         num_envs, task, step_dt = 16, make_task("velocity-flat"), 1.0 / 60.0
 
-    kicked = kicked_walks(Env, np.random.default_rng(0))
+    kicked = walking_tracking.kicked_walks(Env, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(kicked.kick, axis=1), 0.5)  # [m/s]
     assert kicked.kick_time.min() >= 2.0 and kicked.kick_time.max() <= 4.0  # [s]
-    fast, direction = sped_up_walks(Env)  # direction of each walk: 1 backward, 2 sideways, 3 turning
+    fast, direction = walking_tracking.sped_up_walks(Env)  # direction of each walk: 1 backward, 2 sideways, 3 turning
     ahead, left, _ = fast.commands[:, -1].T  # the last, fastest command [m/s]
     np.testing.assert_allclose(ahead[direction == 1], -np.linspace(0.3, 4.0, 4))
     np.testing.assert_allclose(left[direction == 2], np.linspace(0.3, 2.0, 4))
     assert not ahead[direction == 3].any() and not left[direction == 3].any() and fast.times[-1] < 3.0
-
-
-def test_refuses_policy_of_other_task_and_invalid_settings(policies, tmp_path):
-    with pytest.raises(PolicyError, match="suite velocity"):
-        walking_tracking.main(
-            walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")
-        )
-    with pytest.raises(InputError, match="commands_per_axis"):
-        walking_tracking.Args(commands_per_axis=1)
-    with pytest.raises(InputError, match="speed"):
-        walking_terrain.Args(speed=0.9)

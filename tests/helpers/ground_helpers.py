@@ -1,5 +1,7 @@
 """Heights of heightfields, by NumPy and by the solver's kernel function."""
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 
@@ -9,6 +11,15 @@ from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import find_ground, ground_struct
 
 wp.set_module_options({"enable_backward": False})
+
+
+def hardest(task):
+    """Return a copy of the task with only the hardest row of its terrain map; tasks without a map are unchanged."""
+    settings = task.reset.settings
+    terrain = getattr(settings, "terrain", None)
+    if terrain is None or terrain.rows == 0:
+        return task
+    return replace(task, reset=replace(task.reset, settings=replace(settings, terrain=replace(terrain, rows=1))))
 
 
 def heights(field):

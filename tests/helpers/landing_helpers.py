@@ -1,4 +1,4 @@
-"""A policy of any task that holds the default pose, and the apex of the open-loop jump."""
+"""A policy of any task that holds the default pose, and the open-loop jump and its apex."""
 
 import itertools
 
@@ -21,3 +21,16 @@ def still_policy(name):
     sizes = face.sizes
     layers = [(torch.zeros(out, size), torch.zeros(out)) for size, out in itertools.pairwise(sizes)]
     return Policy(layers, torch.zeros(sizes[0]), torch.ones(sizes[0]), face, {"env": {"task": task_to_json(task)}})
+
+
+class OpenLoopPolicy:
+    """Policy that from policy step `begin` on squats for 60 steps and then extends the legs for 20 steps."""
+
+    def __init__(self, begin=31):
+        self.begin, self.step = begin, 0
+
+    def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
+        elapsed = self.step - self.begin
+        self.step += 1
+        level = 0.0 if elapsed < 0 else min(elapsed / 25, 1.0) if elapsed < 60 else -1.0 if elapsed < 80 else 0.0
+        return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)

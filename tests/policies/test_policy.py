@@ -2,9 +2,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
-import pickle
-import re
 
 import numpy as np
 import onnx
@@ -14,7 +11,7 @@ import torch
 
 from jumper_warp.policies import catalog
 from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.folder import add_files, save_policy
+from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import load_policy
@@ -25,7 +22,6 @@ from jumper_warp.utils import assets
 from jumper_warp.utils.assets import policy_tasks
 
 FILTER = dataclasses.asdict(vertical_jump_filter())
-TERM = {"first": 0, "end": 1, "scale": 1.0, "clip": 100.0, "history": 1}  # of an observation layout
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -114,11 +110,6 @@ def edit_config(change):
     return lambda folder: edit_json(folder, "config.json", change)
 
 
-def edit_onnx(change):
-    """Return a function that writes `change` of the content of policy.onnx, with a valid checksum."""
-    return lambda folder: replace_file(folder, "policy.onnx", change((folder / "policy.onnx").read_bytes()))
-
-
 # ---------------------------------------------------------------------- acting
 
 
@@ -146,29 +137,9 @@ def test_non_finite_observation_counts_as_zero(bad):
     assert scalar_policy().act(torch.tensor([bad])) == scalar_policy().act(torch.tensor([0.0]))
 
 
-def test_refuses_an_observation_of_another_size():
-    with pytest.raises(ValueError, match="must have 1 columns, got 2"):
-        scalar_policy().act(torch.zeros(3, 2))
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
-def test_accepts_observations_of_any_numeric_type(dtype):
-    policy = scalar_policy(0.1)
-    action = policy.act(torch.tensor([[3.0]], dtype=dtype))
-    assert action.dtype == torch.float32 and action == policy.act(torch.tensor([[3.0]]))
-
-
 def test_float64_observations_are_clamped_before_conversion():
     policy = scalar_policy(0.1)
     assert policy.act(torch.tensor([1.0e300], dtype=torch.float64)) == policy.act(torch.tensor([100.0]))
-
-
-@pytest.mark.parametrize(
-    ("obs", "message"), [(np.zeros((1, 1)), "must be a torch tensor, got ndarray"), (torch.tensor(1.0), "got a scalar")]
-)
-def test_refuses_observations_that_are_not_vectors_in_tensors(obs, message):
-    with pytest.raises(ValueError, match=message):
-        scalar_policy().act(obs)
 
 
 # ---------------------------------------------------------------------- saving and loading
@@ -198,50 +169,6 @@ def test_folder_without_a_policy_is_never_replaced(tmp_path, trained):
     assert (tmp_path / "mine.txt").exists()
 
 
-@pytest.mark.parametrize("name", ["x.pt", "x.pth", "x.onnx", "x.safetensors", "X.PT"])
-def test_refuses_a_folder_with_a_file_suffix(tmp_path, trained, name):
-    with pytest.raises(PolicyError, match=r"saved as a folder, whose name cannot end in \."):
-        save_policy(tmp_path / name, trained)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["../evil", "manifest.json", ".hidden", ""])
-def test_save_refuses_malformed_file_names_and_writes_nothing(tmp_path, trained, name):
-    with pytest.raises(PolicyError, match="cannot hold a file named"):
-        save_policy(tmp_path / "jump", trained, files={name: b""})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_added_files_are_in_the_manifest(folder):
-    add_files(folder, {"metrics.json": b"{}", "README.md": b"how it was made"})
-    assert load_policy(folder) and (folder / "README.md").read_bytes() == b"how it was made"
-    (folder / "metrics.json").write_bytes(b"{ }")
-    with pytest.raises(PolicyError, match=r"metrics\.json: truncated or altered"):
-        load_policy(folder)
-
-
-@pytest.mark.parametrize("name", ["picture.webp", "sweep.png"])
-def test_missing_picture_is_accepted_and_an_altered_one_refused(folder, trained, name):
-    add_files(folder, {name: b"RIFF", "metrics.json": b"{}"})
-    (folder / name).unlink()
-    assert load_policy(folder).interface == trained.interface
-    (folder / name).write_bytes(b"JFIF")
-    with pytest.raises(PolicyError, match=rf"{name}: truncated or altered"):
-        load_policy(folder)
-    (folder / name).unlink()
-    (folder / "metrics.json").unlink()
-    with pytest.raises(PolicyError, match=r"metrics\.json: no such file"):
-        load_policy(folder)
-
-
-def test_add_files_refuses_policy_files_and_altered_policies(folder):
-    with pytest.raises(PolicyError, match="is the policy itself"):
-        add_files(folder, {"policy.onnx": b""})
-    (folder / "config.json").write_text("{}")
-    with pytest.raises(PolicyError, match="truncated or altered"):
-        add_files(folder, {"metrics.json": b"{}"})
-
-
 def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):
     for module in (assets, catalog):
         monkeypatch.setattr(module, "POLICIES", tmp_path)
@@ -252,143 +179,40 @@ def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):
         load_policy("walk")
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("vertical-jmup", "no policy 'vertical-jmup'; did you mean 'vertical_jump'?"),
-        ("horizontal-jump-mars-loose", "a task, not a policy; its policies: mars_horizontal_jump, mars_springs_jump"),
-        ("Olympus_Walk", "is a task, not a policy; its policies: walking_flat"),
-        ("velocity_trot", "is a task, not a policy; it has no policy yet: jumper train velocity-trot trains one"),
-        ("trained/policy", "trained/policy: no such folder (policy)"),
-        (__file__, "test_policy.py is a file; give the folder of a policy"),
-    ],
-)
-def test_name_of_no_policy_is_refused_with_advice(name, message):
-    with pytest.raises(PolicyError, match=re.escape(message)):
-        find_policy(name)
-
-
-class Payload:
-    """Object that creates a file when unpickled."""
-
-    def __init__(self, path):
-        """Store the path of the file to create."""
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
-def flip_a_bit(folder):
-    """Flip the last bit of policy.onnx."""
-    data = bytearray((folder / "policy.onnx").read_bytes())
-    data[-1] ^= 1
-    (folder / "policy.onnx").write_bytes(data)
-
-
 def change_model(change):
     """Return a function that applies `change` to the ONNX model in a policy's folder, with a valid checksum."""
 
-    def changed_bytes(data):
-        model = onnx.load_model_from_string(data)
+    def changed(folder):
+        model = onnx.load(folder / "policy.onnx")
         change(model)
-        return model.SerializeToString()
+        replace_file(folder, "policy.onnx", model.SerializeToString())
 
-    return edit_onnx(changed_bytes)
-
-
-def change_tensors(**changes):
-    """Return a function that replaces or adds initialisers (name to array) in a policy folder's ONNX file."""
-
-    def change(model):
-        for name, value in changes.items():
-            kept = [tensor for tensor in model.graph.initializer if tensor.name != name]
-            del model.graph.initializer[:]
-            model.graph.initializer.extend([*kept, onnx.numpy_helper.from_array(np.asarray(value), name)])
-
-    return change_model(change)
+    return changed
 
 
-def initialiser(model, name):
-    """Return the initialiser of an ONNX model with this name."""
-    return next(tensor for tensor in model.graph.initializer if tensor.name == name)
+def set_nan(model):
+    """Write NaN into the first bias."""
+    bias = next(tensor for tensor in model.graph.initializer if tensor.name == "actor_0_bias")
+    bias.CopyFrom(onnx.numpy_helper.from_array(np.full(64, np.nan, np.float32), bias.name))
 
 
-def make_external(model):
-    """Let the first weight refer to another file."""
-    tensor = initialiser(model, "actor_0_weight")
-    tensor.data_location = onnx.TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value="/etc/passwd")
-
-
-F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
-NEWER = "has version 4, expected version 3"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: no such file"),
-    "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
-    "manifest of another format": (edit_manifest(lambda m: m.update(format="x")), "not the manifest of"),
-    "manifest lacks a checksum": (edit_manifest(lambda m: m["sha256"].pop("policy.onnx")), "lacks the checksums"),
-    "manifest names a file outside": (edit_manifest(lambda m: m["sha256"].update({"../x": ""})), "names a file"),
-    "newer manifest": (edit_manifest(lambda m: m.update(schema_version=4)), f"manifest.json: {NEWER}"),
-    "newer config": (edit_config(lambda c: c.update(schema_version=4)), f"config.json: {NEWER}"),
     "older version": (
         edit_manifest(lambda m: m.update(schema_version=2)),
         "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
-    "folder in place of a file": (
-        lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
-        "policy.onnx: a folder, not a file",
-    ),
-    "pipe in place of a file": (
-        lambda f: ((f / "policy.onnx").unlink(), os.mkfifo(f / "policy.onnx")),
-        "policy.onnx: not a regular file",
-    ),
-    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: no such file"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
     ),
-    "one bit": (flip_a_bit, "policy.onnx: truncated or altered"),
-    "empty, valid checksum": (edit_onnx(lambda data: b""), "missing or unknown: actor.0.bias"),
-    "truncated, valid checksum": (edit_onnx(lambda data: data[:-4]), "the ONNX file cannot be read"),
-    "layer of another shape": (
-        change_tensors(actor_1_weight=np.zeros((32, 65), F32)),
-        r"actor.1.weight must have the configured shape \(32, 64\), got \(32, 65\)",
-    ),
-    "block with one axis": (
-        change_tensors(actor_1_block=np.zeros(3, F32)),
-        r"actor.1.block must be a matrix, got shape \(3,\)",
-    ),
-    "extra layer": (change_tensors(actor_3_weight=np.zeros((12, 12), F32)), "missing or unknown: actor.3.weight"),
-    "NaN": (change_tensors(actor_0_bias=np.full(64, np.nan, F32)), "actor.0.bias is not finite"),
-    "zero standard deviation": (change_tensors(std=np.zeros(48, F32)), "std must be positive"),
-    "float64": (change_tensors(std=np.ones(48)), "normaliser.std must hold floating-point numbers of 32 bits"),
-    "fewer numbers than the shape": (
-        change_model(lambda m: initialiser(m, "actor_0_weight").dims.append(2)),
-        "actor.0.weight: number of values does not match its shape",
-    ),
-    "name not UTF-8": (
-        edit_onnx(lambda data: data.replace(b"actor_0_bias", b"actor_0_bia\xff")),
-        "missing or unknown: actor.0.bias",
-    ),
-    "weights in another file": (change_model(make_external), NOT_REPRODUCIBLE),
-    "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_REPRODUCIBLE),
+    "NaN": (change_model(set_nan), "actor.0.bias is not finite"),
     "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_REPRODUCIBLE),
-    "another limit": (change_tensors(actions_upper=np.asarray(2.0, F32)), NOT_REPRODUCIBLE),
-    "extra constant": (change_tensors(more=np.zeros(1, F32)), NOT_REPRODUCIBLE),
-    "metadata of another interface": (change_model(lambda m: m.metadata_props.pop()), NOT_REPRODUCIBLE),
     "config of another interface": (edit_config(lambda c: c["interface"].update(policy_dt=0.02)), NOT_REPRODUCIBLE),
     "other sizes in config": (
         edit_config(lambda c: c["interface"].update(hidden=[64, 32, 8])), "missing or unknown: actor.3",
     ),
-    "interface lacks a field": (
-        edit_config(lambda c: c["interface"].pop("policy_dt")), "missing or unknown: policy_dt",
-    ),
-    "interface with another type": (
-        edit_config(lambda c: c["interface"].update(policy_dt="fast")), "policy_dt must be a float",
-    ),
-    "no interface": (edit_config(lambda c: c.pop("interface")), "must be a JSON object"),
 }  # fmt: skip
 """A function that damages a policy's folder (of `trained`), and the error message, by name."""
 
@@ -402,40 +226,18 @@ def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
     assert "\n" not in str(refusal.value)
 
 
-def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
-    trap = tmp_path / "executed"
-    replace_file(folder, "policy.onnx", pickle.dumps(Payload(trap)))
-    with pytest.raises(PolicyError, match="cannot be read"):
-        load_policy(folder)
-    assert not trap.exists()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
-        ({"joint_names": ("a,b",)}, "names may contain letters, digits"),
-        ({"task": "../jump"}, "names may contain letters, digits"),
-        ({"torque_limit": (0.0,)}, "torque_limit must lie in 0.001 to 1e"),
-        ({"joint_damping": (-1.0,)}, "joint_damping must lie in 0 to 1000, got -1"),
         ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
-        ({"normalised_limit": 1e300}, "normalised_limit must lie in 0.001 to 1e"),
-        ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
         (
             {"command_filter": {"horizon": 0.1}},
             "command_filter must have the fields lateral, transversal, sum, horizon",
         ),
-        ({"command_filter": FILTER | {"horizon": math.inf}}, "command_filter horizon must be a finite number"),
-        ({"command_filter": FILTER | {"speed_floor": 0.0}}, "command_filter: filter speed_floor must be in 0.001"),
         ({"command_filter": FILTER | {"sum": FILTER["lateral"] | {"lower": 20.0}}}, "sum: lower limit must be below"),
         ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
-        ({"observation_layout": {"x": TERM | {"clip": -1.0}}}, "'x': clip must lie in 1e-6 to 1e6, got -1.0"),
-        ({"observation_layout": {"x": TERM | {"history": 1.0}}}, "first, end and history whole numbers"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
-        ({"action_scale": (math.nan,)}, "action_scale must lie in 0.0001 to 6.283, got nan"),
-        ({"policy_dt": 0.0}, "policy_dt must lie in 0.0001 to 1, got 0"),
-        ({"hidden": ()}, "hidden must name 1 to 64 widths"),
-        ({"activation": "gelu"}, "activation must be one of"),
         ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
     ],
 )
@@ -503,32 +305,3 @@ def test_onnx_is_one_file_and_reproducible(folder, trained):
     model = onnx.load(folder / "policy.onnx", load_external_data=False)
     assert all(tensor.data_location == onnx.TensorProto.DEFAULT for tensor in model.graph.initializer)
     assert onnx_bytes(trained) == onnx_bytes(trained)
-
-
-def test_repeated_diagonal_block_is_stored_once(tmp_path):
-    """A weight of two equal diagonal blocks and zeros; it is stored whole if a zero is another one bitwise."""
-    torch.manual_seed(0)
-    block = torch.randn(8, 16)
-    layers = [(torch.randn(32, 4), torch.randn(32)), (torch.block_diag(block, block), torch.randn(16)),
-              (torch.randn(2, 16), torch.randn(2))]  # fmt: skip
-    policy = Policy(layers, torch.randn(4), torch.rand(4) + 0.1, make_interface(4, 2, (32, 16)))
-    folder = save_policy(tmp_path / "symmetric", policy)
-    model = onnx.load(folder / "policy.onnx")
-    assert tuple(initialiser(model, "actor_1_block").dims) == (8, 16)
-    assert "actor_1_weight" not in {tensor.name for tensor in model.graph.initializer}
-    for layer, expected in zip(load_policy(folder).layers, policy.layers, strict=True):
-        assert torch.equal(layer[0], expected[0]) and torch.equal(layer[1], expected[1])
-    session, obs = onnxruntime.InferenceSession(str(folder / "policy.onnx")), torch.randn(5, 4)
-    np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
-    layers[1][0][0, 16] = -0.0  # not bitwise the zero that the graph pads with
-    whole = save_policy(tmp_path / "whole", Policy(layers, policy.mean, policy.std, policy.interface))
-    assert initialiser(onnx.load(whole / "policy.onnx"), "actor_1_weight").dims == [16, 32]
-
-
-@pytest.mark.parametrize("source", ["vertical-jump", "vertical-jump/run"])
-def test_a_training_without_a_checkpoint_is_named_as_such(tmp_path, source):
-    run = tmp_path / "vertical-jump" / "run"
-    run.mkdir(parents=True)
-    (run / "metrics.jsonl").write_text("{}\n")
-    with pytest.raises(PolicyError, match=f"{source}: no checkpoint yet; a training saves them at its end"):
-        load_policy(tmp_path / source)

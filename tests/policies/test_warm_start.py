@@ -6,13 +6,11 @@ import pytest
 import torch
 
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.policies.spec import PolicyError
 from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface, task_symmetry
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 
 WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a symmetric actor has twice the widths
@@ -56,17 +54,6 @@ def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, mess
     assert "\n" not in str(caught.value)
 
 
-def test_refuses_an_unknown_policy():
-    with pytest.raises(PolicyError, match="no_jump"):
-        actor_init_from_policy("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
-
-
-def test_refuses_a_policy_with_another_history():
-    task, cfg = with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
-    with pytest.raises(InputError, match=r"init_policy: observation \d+: the policy has \w+"):
-        actor_init_from_policy("horizontal_jump", task, cfg)
-
-
 def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
     symmetry = task_symmetry(task)
@@ -76,31 +63,6 @@ def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     obs = policy.mean + policy.std * torch.randn(500, 147, generator=torch.manual_seed(2))
     assert start.change == "made mirror-symmetric"
     assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01
-
-
-def changed_layout(spec):
-    """Return the observation layout of an interface with 7 as the first term's scale, as changes of its fields."""
-    layout = {name: dict(term) for name, term in spec.observation_layout.items()}
-    next(iter(layout.values()))["scale"] = 7.0
-    return {"observation_layout": layout}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
-        (lambda spec: {"joint_names": spec.joint_names[1:] + spec.joint_names[:1]},
-         r"action 0: the policy has FL_outer, the task FL_lateral"),
-        (lambda spec: {"default_joint_pos": (1.0, *spec.default_joint_pos[1:])},
-         "default angle .*: the policy has 1.0"),
-        (lambda spec: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
-        (lambda spec: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
-    ],
-)  # fmt: skip
-def test_error_message_names_the_first_difference_of_the_interfaces(change, message):
-    spec = open_policy("horizontal_jump").interface
-    with pytest.raises(InputError, match=message):
-        check_interface(dataclasses.replace(spec, **change(spec)), interface(make_task("horizontal-jump")))
 
 
 def test_scales_gains_and_an_unknown_layout_may_differ():

@@ -2,20 +2,16 @@
 
 import dataclasses
 import itertools
-import json
 
 import pytest
 import torch
-from test_train import final_state, make_env
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
-from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.rl.mirror import contract_layers, expand_layers, nearest_expanded_layers, symmetry_of
-from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic
+from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
 from jumper_warp.utils.errors import InputError
-from toy_task import SMALL, PushTask, push_cfg
+from toy_task import SMALL, PushTask
 
 SYMMETRY = symmetry_of(PushTask(1))
 SYMMETRIC = dataclasses.replace(SMALL, symmetry="actor")
@@ -47,13 +43,6 @@ def actor_init_of(model, cfg=SMALL, activation="elu"):
     return make_actor_init(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
 
 
-@pytest.fixture
-def cfg(tmp_path):
-    """Settings of one iteration from the policy "pusher", with a negligible learning rate."""
-    ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
-    return push_cfg(tmp_path, max_iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
-
-
 # ---------------------------------------------------------------- layers of a symmetric actor
 
 
@@ -64,28 +53,6 @@ def test_contract_inverts_expand_of_symmetric_layers(hidden):
     contracted = contract_layers(expand_layers(layers, SYMMETRY), SYMMETRY)
     for layer, result in zip(layers, contracted, strict=True):
         torch.testing.assert_close(result, layer, atol=0.0, rtol=0.0)
-
-
-def changed(layers, index, part):
-    """Return a copy of the layers with 0.01 added to the last entry of a weight (part 0) or bias (part 1)."""
-    layers = [tuple(tensor.clone() for tensor in layer) for layer in layers]
-    layers[index][part].view(-1)[-1] += 0.01
-    return layers
-
-
-@pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("part", [0, 1], ids=["weight", "bias"])
-def test_contract_refuses_layers_that_are_not_symmetric(index, part):
-    layers = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
-    with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        contract_layers(changed(layers, index, part), SYMMETRY)
-
-
-@pytest.mark.parametrize("sizes", [(2, 8, 7, 1), (2, 7, 1), (2, 1, 1), (3, 8, 1), (2, 8, 2)])
-def test_contract_refuses_sizes_of_no_symmetric_actor(sizes):
-    layers = layers_of(ActorCritic(sizes[0], sizes[-1], sizes[1:-1]))
-    with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
-        contract_layers(layers, SYMMETRY)
 
 
 @pytest.mark.parametrize("hidden", [(16,), (32, 24), (8, 6, 4)])
@@ -130,22 +97,6 @@ def test_initialised_actor_acts_as_the_policy(policy_symmetry, symmetry, hidden)
     torch.testing.assert_close(ppo.rollout.mean[0].clamp(-1.0, 1.0), model.act(ppo.rollout.obs[0]), atol=1e-5, rtol=0.0)
 
 
-@pytest.mark.parametrize(
-    ("symmetric", "change", "message"),
-    [
-        (False, {"hidden": (16, 8)}, "has hidden layers 32, 32, the settings 16, 8: pass --ppo.hidden 32 32"),
-        (True, {}, "has hidden layers 64, 64, the settings 32, 32: pass --ppo.hidden 64 64"),
-        (True, {"symmetry": "actor", "hidden": (9,)}, "layers 64, 64, the settings 18: pass --ppo.hidden 32 32"),
-        (False, {"symmetry": "actor", "hidden": (9,)}, "layers 32, 32, the settings 9: pass --ppo.hidden 32 32"),
-        (False, {"activation": "tanh"}, "has activation elu, the settings tanh: pass --ppo.activation elu"),
-    ],
-)
-def test_refuses_settings_of_another_network_in_one_line(symmetric, change, message):
-    with pytest.raises(InputError, match=f"init_policy: the policy .*{message}") as caught:
-        actor_init_of(actor(symmetry=SYMMETRY if symmetric else None), dataclasses.replace(SMALL, **change))
-    assert "\n" not in str(caught.value)
-
-
 def averaged(act, obs):
     """Return (act(x) + N act(M x)) / 2 of a policy, in the notation of `jumper_warp.rl.mirror`."""
     return 0.5 * (act(obs) + SYMMETRY.action.apply(act(SYMMETRY.obs.apply(obs))))
@@ -184,65 +135,3 @@ def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
         torch.testing.assert_close(result, expected)
     with pytest.raises(InputError, match=r"pass --ppo\.hidden 64 64"):  # the average with the image keeps full widths
         make_actor_init(far, *scaling, "elu", SYMMETRIC, SYMMETRY)
-
-
-def test_refuses_a_standard_deviation_below_the_variance_epsilon():
-    model = actor()
-    model.obs_moments.var.zero_()
-    apply_actor_init(actor_init_of(model), model, samples=1)
-    assert (model.obs_moments.var >= 0.0).all() and (model.obs_moments.var < 0.01 * VARIANCE_EPS).all()
-    with pytest.raises(InputError, match=r"std must be at least 0\.00316, got 0\.001"):
-        make_actor_init(layers_of(model), torch.zeros(2), torch.tensor([1.0, 1e-3]), "elu", SMALL)
-
-
-def test_refuses_a_model_of_other_sizes_without_changing_it():
-    model = ActorCritic(3, 1, (32, 32))
-    before = model.actor[0].weight.clone()
-    with pytest.raises(InputError, match=r"init_policy: .* of shapes \(32, 2\), .* the training's \(32, 3\)"):
-        apply_actor_init(actor_init_of(actor()), model, samples=1)
-    assert torch.equal(model.actor[0].weight, before) and not model.obs_moments.count
-
-
-# ---------------------------------------------------------------- trainings
-
-
-def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys):
-    model = actor()
-    result = train(cfg, make_env, actor_init=actor_init_of(model))
-    model_state, stderr = final_state(result)["ppo"]["model"], capsys.readouterr().err.splitlines()
-    assert stderr[1] == "starts from pusher"
-    torch.testing.assert_close(model_state["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)
-    torch.testing.assert_close(model_state["log_std"], torch.zeros(1), atol=1e-6, rtol=0.0)
-    samples = 32 * SMALL.num_steps  # of 32 worlds
-    assert model_state["obs_moments.count"] == (PRIOR_ITERATIONS + 1) * samples
-    assert 0.0 < (model_state["obs_moments.mean"] - model.obs_moments.mean).abs().max() < 0.05
-    assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
-
-
-def test_resume_uses_the_checkpoint_and_keeps_the_initial_policys_name(cfg, capsys):
-    first = train(cfg, make_env, actor_init=actor_init_of(actor()))
-    capsys.readouterr()
-    resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2)
-    second = train(resumed, make_env)
-    assert "starts from" not in capsys.readouterr().err
-    assert final_state(second)["ppo"]["model"]["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
-    assert json.loads((second.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
-
-
-@pytest.mark.parametrize("lacks_setting", [True, False])
-def test_resumes_a_checkpoint_that_started_from_random_weights(cfg, lacks_setting):
-    """lacks_setting: whether the checkpoint's configuration has no entry init_policy."""
-    first = train(dataclasses.replace(cfg, init_policy=None), make_env)
-    path = first.folder / CHECKPOINTS / "iteration_000001.pt"
-    state = load_checkpoint(path)
-    config = json.loads(state["config"])
-    assert config["train"].pop("init_policy", 0) is None
-    save_checkpoint(path.parent, {**state, "config": json.dumps(config) if lacks_setting else state["config"]})
-    result = train(dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2), make_env)
-    assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] is None
-
-
-def test_policy_name_and_actor_init_need_each_other(cfg):
-    for init_policy, start in (("pusher", None), (None, actor_init_of(actor()))):
-        with pytest.raises(InputError, match=r"init_policy and actor_init.* must be passed together"):
-            train(dataclasses.replace(cfg, init_policy=init_policy), make_env, actor_init=start)

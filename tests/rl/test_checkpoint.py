@@ -1,5 +1,4 @@
 import itertools
-import json
 import os
 import pickle
 
@@ -14,7 +13,6 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from jumper_warp.utils.files import write_atomically
 
 
 def state(iteration):
@@ -58,12 +56,6 @@ def test_nan_score_counts_as_no_score(tmp_path):
     assert best_checkpoint(tmp_path) == best
 
 
-def test_best_checkpoint_without_scores_is_the_newest(tmp_path):
-    save_checkpoint(tmp_path, state(1))
-    newest = save_checkpoint(tmp_path, state(2))
-    assert best_checkpoint(tmp_path) == newest
-
-
 def flip(path):
     """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
@@ -76,26 +68,8 @@ def cut(path):
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def empty_manifest(path):
-    """Remove all entries from the manifest in a checkpoint's folder."""
-    (path.parent / MANIFEST).write_text("{}")
-
-
-def break_manifest(path):
-    """Write a manifest whose entry for the checkpoint is a number."""
-    (path.parent / MANIFEST).write_text('{"iteration_000002.pt": 3}')
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (flip, "differs from its checksum"),
-        (cut, "differs from its checksum"),
-        (os.remove, "no such file .checkpoint of a training"),
-        (empty_manifest, "has no checksum"),
-        (break_manifest, "manifest.json: not readable"),
-        (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: no such file"),
-    ],
+    ("damage", "message"), [(flip, "differs from its checksum"), (os.remove, "no such file .checkpoint of a training")]
 )
 def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):
     path = save_checkpoint(tmp_path, state(2))
@@ -122,12 +96,6 @@ def test_loading_a_checkpoint_executes_no_code(tmp_path, monkeypatch):
     assert (tmp_path / "executed").exists()
 
 
-def test_refuses_a_checkpoint_with_missing_parts(tmp_path):
-    path = save_checkpoint(tmp_path, {"iteration": 1, "ppo": {}})
-    with pytest.raises(CheckpointError, match="lacks env, rng, config"):
-        load_checkpoint(path)
-
-
 def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
     cut(paths[2])
@@ -151,33 +119,3 @@ def test_only_checkpoint_stays_usable_if_saving_it_again_is_stopped(tmp_path, mo
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(tmp_path, state(1) | {"seconds": 2.0}, max_checkpoints=1)
     assert latest_checkpoint(tmp_path).state["iteration"] == 1
-
-
-def test_latest_checkpoint_raises_if_all_are_damaged(tmp_path):
-    cut(save_checkpoint(tmp_path, state(1)))
-    with pytest.raises(CheckpointError, match=r"no usable checkpoint.*differs from its checksum"):
-        latest_checkpoint(tmp_path)
-
-
-def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    write_atomically(path, b"old")
-
-    def full_disk(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left") as caught:
-        write_atomically(path, b"new")
-    assert caught.value.filename == str(path)  # run_command prints errors with a file name in one line
-    assert path.read_bytes() == b"old"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
-
-
-def test_latest_checkpoint_ignores_files_missing_from_the_manifest(tmp_path):
-    first = save_checkpoint(tmp_path, state(1))
-    manifest = (tmp_path / MANIFEST).read_text()
-    save_checkpoint(tmp_path, state(2))
-    (tmp_path / MANIFEST).write_text(manifest)  # as after an interruption between the two writes
-    assert latest_checkpoint(tmp_path)[0] == first
-    assert json.loads(manifest).keys() == {first.name}

@@ -6,17 +6,7 @@ import importlib.util
 import pytest
 import torch
 
-from fused_runs import (
-    FUSED,
-    NoiseTask,
-    compiled_variants,
-    failed_compilation,
-    interpreted,
-    iterations,
-    minibatch_gradients,
-    update_rank,
-    whole_and_resumed,
-)
+from fused_runs import FUSED, NoiseTask, interpreted, iterations, minibatch_gradients, update_rank, whole_and_resumed
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
@@ -77,22 +67,6 @@ def test_iteration_agrees_with_pytorch():
 
 
 @needs_triton
-def test_kernels_that_do_not_compile_are_an_input_error():
-    assert interpreted(failed_compilation).startswith(
-        "the fused kernels do not work here, pass --ppo.no-fused: RuntimeError shape '[3]'"
-    )
-
-
-@needs_triton
-def test_each_variant_of_a_kernel_is_compiled_once_and_not_launched():
-    compiled, meanwhile, afterwards, message = interpreted(compiled_variants)
-    options = ((7,), 8, 3)
-    assert compiled == [(False, 3, *options), (True, 3, *options), (True, 4, *options)]
-    assert (meanwhile, afterwards) == (0, 4)
-    assert message == "does not compile"
-
-
-@needs_triton
 def test_resumed_training_is_bitwise_equal(tmp_path):
     whole, resumed = interpreted(whole_and_resumed, tmp_path)
     for part in ("ppo", "env", "rng"):
@@ -109,19 +83,6 @@ def test_two_ranks_with_different_worlds_have_the_same_parameters(tmp_path):
 
 
 # ---------------------------------------------------------------- without Triton
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"hidden": (16, 9)}, "they need hidden widths that are multiples of 16, got 16, 9"),
-        ({"activation": "tanh"}, "they need the activation elu, got tanh"),
-    ],
-)
-def test_other_networks_use_pytorch_and_print_a_line(change, reason, capsys, monkeypatch):
-    monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert type(make_ppo(PushTask(4), dataclasses.replace(FUSED, **change))) is Ppo
-    assert capsys.readouterr().err == f"PPO trains with PyTorch, more slowly than with fused kernels: {reason}\n"
 
 
 def test_cpu_and_no_fused_use_pytorch_silently(capsys, monkeypatch):

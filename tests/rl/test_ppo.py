@@ -6,10 +6,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
-from torch.utils._python_dispatch import TorchDispatchMode
 
-from jumper_warp.rl import networks
-from jumper_warp.rl import ppo as ppo_module
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import adapted_lr
 from jumper_warp.rl.ppo import STATISTICS, Ppo
@@ -244,33 +241,6 @@ def test_non_finite_gradient_changes_no_parameter():
     assert ppo.statistics()["Loss/skipped"] == 1.0
 
 
-class NoHost(TorchDispatchMode):
-    """Mode in which an operation that waits for a result on the device, or has a shape from it, fails the test."""
-
-    refused = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal")
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        """Run an operator of torch unless it is refused; boolean indices are, since their result's shape varies."""
-        name = func.overloadpacket.__name__
-        assert name not in self.refused, name
-        if name in ("index", "index_put", "index_put_"):
-            assert all(index is None or index.dtype != torch.bool for index in args[1]), "boolean index"
-        return func(*args, **(kwargs or {}))
-
-
-def test_iteration_has_no_host_synchronisation():
-    ppo = Ppo(PushTask(16), PLAIN)
-    ppo.env.reset()
-    with NoHost():
-        ppo.collect()
-        ppo.update()
-
-
-def test_host_synchronisation_check_detects_item():
-    with pytest.raises(AssertionError, match="_local_scalar_dense"), NoHost():
-        torch.ones(()).item()
-
-
 def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
     cfg = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 8))
     processes = torch.multiprocessing.spawn(
@@ -298,32 +268,6 @@ def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
         torch.testing.assert_close(result["lr"], expected["lr"])
 
 
-def test_iteration_all_reduces_moments_once_and_each_minibatch_gradient(monkeypatch):
-    cfg = dataclasses.replace(PLAIN, epochs=3, minibatches=4, normalise_value=True)
-    ppos = []
-    for ranks in (1, 2):
-        sizes = []
-
-        def all_reduce_mean(x, sizes=sizes):
-            sizes.append(x.numel())
-            return x  # as if the other rank had the same samples
-
-        monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
-        for module in (networks, ppo_module):
-            monkeypatch.setattr(module, "all_reduce_mean", all_reduce_mean)
-        torch.manual_seed(0)
-        ppos.append(Ppo(PushTask(16), cfg))
-        ppos[-1].env.reset()
-        ppos[-1].collect()
-        ppos[-1].update()
-    alone, one_of_two = ppos
-    moments = 2 * (1 + 1 + 2 + 3)  # mean and variance of advantage, return, observation and critic's observation
-    assert sizes == [moments] + 12 * [alone.flat.all_reduced.numel()]  # 3 epochs of 4 minibatches
-    torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
-    torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
-    assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
-
-
 FLOAT32_COUNT_LIMIT = 2.0**24
 """Largest count in float32: adding 1 changes nothing."""
 
@@ -342,14 +286,6 @@ def test_counters_are_exact_beyond_the_range_of_float32():
     sums = [ppo._sums[STATISTICS.index(name)].item() for name in ("entropy", "skipped")]
     entropy, skipped = (value - FLOAT32_COUNT_LIMIT for value in sums)
     assert 0.0 < abs(entropy) < 10.0 and entropy != round(entropy) and skipped == 0.0
-
-
-def test_loads_episode_counts_in_float32():
-    state = trained(2)[0].state_dict()
-    state["episode"] = state["episode"].float()
-    other = Ppo(PushTask(128), SMALL)
-    other.load_state_dict(state)
-    assert torch.equal(other.collector.episode, state["episode"].double())
 
 
 def noise_gradient(ppo, progress):
@@ -396,16 +332,6 @@ def test_load_state_dict_resumes_bitwise():
         ({"hidden": ()}, "hidden must name"),
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be in 1e-06 to 100, got nan"),
-        ({"reward_scale": float("inf")}, "reward_scale must be in .*, got inf"),
-        ({"reward_scale": 1e-50}, "reward_scale must be in .*, got 1e-50"),
-        ({"init_std": 1e39}, "init_std must be in 0.0001 to 100, got 1e"),
-        ({"entropy_coef": float("nan")}, "entropy_coef must be in .*, got nan"),
-        ({"value_coef": float("inf")}, "value_coef must be in"),
-        ({"desired_kl": float("nan")}, "desired_kl must be in 0 to 100 nat"),
-        ({"final_entropy_coef": -1.0}, "final_entropy_coef must be in .*, got -1.0"),
-        ({"final_desired_kl": -1.0}, "final_desired_kl must be in"),
-        ({"max_lr": float("inf")}, "max_lr must be in 0 to 10, got inf"),
-        ({"lr": float("nan")}, "lr must be in .*, got nan"),
     ],
 )
 def test_refuses_settings_out_of_range(change, message):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,12 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from jumper_warp.envs.rsl_rl import RslRlVecEnv
-from jumper_warp.rl import resume
-from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint
+from jumper_warp.rl.checkpoint import latest_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.locks import LOCK, write_lock
+from jumper_warp.utils.locks import LOCK
 from toy_task import PushTask, push_cfg
 
 HOLDER = """
@@ -60,42 +57,3 @@ def test_lock_file_of_a_killed_process_does_not_block(cfg, holder):
     holder.wait()
     assert (Path(cfg.resume) / LOCK).is_file()
     assert train(cfg, PushTask).iteration == 4
-
-
-def test_copy_of_a_run_can_be_resumed_while_the_run_is_written(cfg, holder):
-    copy = shutil.copytree(cfg.resume, Path(cfg.resume).with_name("copy"))
-    assert train(dataclasses.replace(cfg, resume=str(copy)), PushTask).folder == copy
-
-
-class LockedDuringTraining(PushTask):
-    """Task that checks in each step that no other writer gets the lock of the only run."""
-
-    root: Path
-
-    def step(self, action):
-        super().step(action)
-        (folder,) = self.root.glob("push/*")
-        with pytest.raises(InputError, match="another process"), write_lock(folder):
-            pass
-
-
-@pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
-def test_new_run_is_locked_until_its_end(tmp_path, trainer):
-    LockedDuringTraining.root = tmp_path
-    cfg = push_cfg(tmp_path, max_iterations=1, trainer=trainer)
-    folder = train(cfg, LockedDuringTraining, as_rsl_rl=RslRlVecEnv).folder
-    with write_lock(folder):
-        pass
-
-
-def test_checkpoint_saved_by_another_process_meanwhile_is_not_overwritten(cfg):
-    checkpoint = resume.find_checkpoint(cfg)
-    train(cfg, PushTask)
-    with pytest.raises(CheckpointError, match="another process has saved a checkpoint; resume again"):
-        train(cfg, PushTask, checkpoint=checkpoint)
-
-
-def test_lock_file_beside_a_folder_is_removed(tmp_path):
-    with write_lock(tmp_path / "tuned", tmp_path / ".tuned.lock"):
-        assert (tmp_path / ".tuned.lock").is_file()
-    assert not any(tmp_path.iterdir())

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from jumper_warp.cli.main import main
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.registry import TASKS, TaskEntry, make_task
+from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
@@ -145,29 +144,3 @@ def test_symmetric_actor_resumes_only_with_the_same_symmetry():
         second.load_state_dict(wrong)
     with pytest.raises(InputError, match=r"unexpected entries: mirror_\w+, mirror_\w+, mirror_\w+ and 1 more"):
         Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
-
-
-def test_refuses_symmetry_for_a_task_without_mirror_map_in_one_line(capsys, monkeypatch):
-    monkeypatch.setitem(TASKS, "hold-height", TaskEntry("hold_height:hold_height"))
-    with pytest.raises(SystemExit):
-        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--max-iterations", "1"])
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "hold-height actor: the mirror image of" in lines[0]
-
-
-def test_refuses_symmetry_for_an_env_without_mirror_map_or_of_another_size():
-    class Plain(PushTask):
-        mirror = None  # the environment defines no mirror map
-
-    class WrongSize(PushTask):
-        def mirror(self, what):
-            return [0], [1.0]  # one entry, observations have two
-
-    for env in (Plain, WrongSize):
-        with pytest.raises(InputError, match="mirror image"):
-            Ppo(env(4), CFG)
-
-
-def test_refuses_symmetry_with_another_trainer():
-    with pytest.raises(InputError, match="symmetry is not supported with trainer rsl-rl"):
-        TrainCfg(trainer="rsl-rl", ppo=CFG)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -71,13 +70,3 @@ def test_two_nodes_with_a_killed_process_agree_with_one_node(one_node, tmp_path)
     names = sorted(path.name for path in (run / CHECKPOINTS).glob("*.pt"))
     assert names == [f"iteration_00000{i}.pt" for i in (2, 4, 6)]
     assert_same_training(run, one_node)
-
-
-def test_refuses_processes_with_different_checkpoints(one_node, tmp_path):
-    """Each node has a separate log folder, of which only one has a run to resume."""
-    shutil.copytree(one_node.parents[1], tmp_path / "0")
-    (tmp_path / "1").mkdir()
-    agents = start(tmp_path / "{node}", 2)
-    stderr = [agent.communicate(timeout=240)[1] for agent in agents]
-    assert [agent.returncode for agent in agents] == [1, 1]
-    assert any("the processes found different checkpoints" in text for text in stderr)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
@@ -17,7 +16,7 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
 from jumper_warp.rl.stop_request import StopRequest
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
@@ -57,27 +56,15 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     assert json.loads(final_state(result)["config"]) == settings
 
 
-def test_logged_iterations_are_printed(cfg, capsys):
-    result = train(cfg, make_env)
-    metrics, stderr = result.metrics, capsys.readouterr().err.splitlines()
-    fps, total = f"{metrics['Perf/total_fps']:,.0f}", f"{metrics['Train/mean_reward']:.2f}"
-    success = f"{100.0 * metrics['Metrics/success']:.1f}"
-    assert stderr[0] == f"run {result.folder}"
-    assert stderr[1].startswith("iteration 2/4, 0.00 M steps: ") and stderr[1].endswith(" s left")
-    assert stderr[2] == f"iteration 4/4, 0.00 M steps: {fps} steps/s, reward {total}, success {success} %, 0 s left"
-    saved = f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"
-    assert stderr[3:] == ["ended by --max-iterations 4", saved]
-
-
 def resume_after(cfg, seconds, limit):
     """Resume a checkpoint of 2 iterations; return the `TrainingRun` and its result.
 
-    seconds: training time in the checkpoint [s], None: missing. limit: max_seconds [s].
+    seconds: training time in the checkpoint [s]; limit: max_seconds [s].
     """
     half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
-    save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
+    save_checkpoint(half.folder / CHECKPOINTS, {**state, "seconds": seconds})
     cfg = dataclasses.replace(cfg, max_iterations=100_000, max_seconds=limit, resume=str(half.folder))
     run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     with StopRequest() as stop:
@@ -96,16 +83,6 @@ def test_resumed_run_past_its_time_limit_ends_immediately(cfg):
     assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
 
 
-def test_resume_without_saved_time_counts_from_zero(cfg):
-    result = resume_after(cfg, None, limit=0.3)[1]
-    assert 0.3 <= final_state(result)["seconds"] <= result.seconds < 5.0
-
-
-def test_refuses_a_checkpoint_with_a_malformed_time_in_one_line(cfg):
-    with pytest.raises(CheckpointError, match=r"does not fit these settings: seconds must be .*'late'"):
-        resume_after(cfg, "late", limit=100.0)
-
-
 def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     result = train(cfg, make_env)
     (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
@@ -116,13 +93,6 @@ def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     assert "iteration_000002.pt" in stderr
 
 
-def test_refuses_to_resume_a_damaged_checkpoint_by_name(cfg):
-    path = train(cfg, make_env).folder / CHECKPOINTS / "iteration_000004.pt"
-    path.write_bytes(b"cut")
-    with pytest.raises(CheckpointError, match="differs from its checksum"):
-        train(dataclasses.replace(cfg, resume=str(path)), make_env)
-
-
 @pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric_critic": False}])
 def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg, change):
     result = train(cfg, make_env)
@@ -130,22 +100,6 @@ def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg, change):
     with pytest.raises(CheckpointError, match="does not fit these settings") as caught:
         train(other, make_env)
     assert "\n" not in str(caught.value)
-
-
-def test_refuses_a_checkpoint_without_the_critics_statistics_in_one_line(cfg):
-    result = train(cfg, make_env)
-    old = final_state(result)
-    for name in ("mean", "var", "count"):
-        del old["ppo"]["model"][f"critic_moments.{name}"]
-    save_checkpoint(result.folder / CHECKPOINTS, old)
-    with pytest.raises(CheckpointError, match=r"does not fit these settings: .*critic_moments") as caught:
-        train(dataclasses.replace(cfg, resume=str(result.folder)), make_env)
-    assert "\n" not in str(caught.value)
-
-
-def test_resume_latest_raises_without_a_run(cfg):
-    with pytest.raises(CheckpointError, match="no run to resume"):
-        train(dataclasses.replace(cfg, resume="latest"), make_env)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -166,16 +120,6 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
     *_, cause, last = capsys.readouterr().err.splitlines()
     assert cause == "ended by an interruption after 0.00 M of 0.05 M steps"
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
-
-
-def test_second_interrupt_raises_immediately(cfg):
-    class InterruptingTask(PushTask):  # sends Ctrl-C to this process at every step
-        def step(self, action):
-            super().step(action)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg, InterruptingTask)
 
 
 class InterruptedSave(PushTask):
@@ -247,20 +191,6 @@ def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
     assert final_state(result)["iteration"] == result.iteration
 
 
-def test_failed_save_is_reported_and_training_continues(cfg, capsys):
-    class BlockingTask(PushTask):  # its metrics are read before each checkpoint
-        def metrics(self):
-            for folder in cfg.log_root.glob("push/*"):
-                (folder / CHECKPOINTS).touch()  # a file where the folder should go
-            return super().metrics()
-
-    with pytest.raises(CheckpointError, match="not saved"):
-        train(cfg, BlockingTask)
-    assert "retried later" in capsys.readouterr().err
-    (metrics,) = cfg.log_root.glob(f"push/*/{METRICS_FILE}")
-    assert len(metrics.read_text().splitlines()) == 2
-
-
 def test_tensorboard_gets_the_metrics(cfg):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -299,10 +229,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
     [
         ({"max_iterations": 0}, "max_iterations must be a whole number of 1 to 1000000000, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
-        ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
-        ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
-        ({"seed": 2**31}, "seed must be in"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
         ({"trainer": "shac"}, "trainer must be ppo or rsl-rl, got 'shac'"),
     ],
@@ -312,87 +239,12 @@ def test_refuses_settings_out_of_range(change, message):
         TrainCfg(**change)
 
 
-def must_not_be_built(num_envs, seed, device):
-    """Fail the test in place of making an environment."""
-    pytest.fail("the environment was built")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"ppo": dataclasses.replace(SMALL, minibatches=7)}, "7 minibatches do not divide 16 x 32 samples"),
-        ({"num_envs": 1, "ppo": dataclasses.replace(SMALL, num_steps=1, minibatches=1)}, "at least 2 samples"),
-    ],
-)
-def test_refuses_indivisible_batches_before_the_env_is_built(cfg, change, message):
-    with pytest.raises(ValueError, match=message):
-        train(dataclasses.replace(cfg, **change), must_not_be_built)
-
-
-def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
-    class UnsteppedTask(PushTask):
-        def step(self, action):
-            pytest.fail("an iteration began")
-
-    message = (
-        r"best_metric must name a logged metric, such as Metrics/success, Train/mean_episode_length, .*, got 'nonsense'"
-    )
-    with pytest.raises(ValueError, match=message):
-        train(dataclasses.replace(cfg, best_metric="nonsense"), UnsteppedTask)
-    assert not cfg.log_root.exists()
-
-
 def test_every_logged_metric_can_be_the_best_metric(cfg):
     """A training is set up with the name of each metric that another one logged; a wrong name raises an error."""
     metrics = train(cfg, make_env).metrics
     for name in metrics:
         TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     assert {"Train/mean_reward", "Perf/total_fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
-
-
-def test_trains_with_the_largest_seed(cfg):
-    assert train(dataclasses.replace(cfg, seed=2**31 - 1, max_iterations=1), make_env).iteration == 1
-
-
-def test_log_root_may_be_a_string(cfg):
-    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), max_iterations=1), make_env)
-    assert result.folder.parent == cfg.log_root / "push"
-
-
-def test_refuses_a_missing_device(cfg, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match="torch finds no GPU"):
-        train(dataclasses.replace(cfg, device="cuda"), make_env)
-
-
-def test_rsl_rl_adapter_returns_copies():
-    env = PushTask(3, episode_length=2)  # timeout in the second step, not in the first
-    env.reset()
-    adapter = RslRlVecEnv(env, metrics_every=2)
-    first = adapter.get_observations()
-    obs, reward, done, extras = adapter.step(torch.ones(3, 1))
-    results = (first["actor"], first["critic"], obs["actor"], obs["critic"], reward, done, extras["time_outs"])
-    copies = [value.clone() for value in results]
-    adapter.step(torch.ones(3, 1))
-    for value, copy in zip(results, copies, strict=True):
-        assert torch.equal(value, copy)
-
-
-@pytest.mark.parametrize(("asymmetric_critic", "column"), [(True, 2), (False, 0)])
-def test_rsl_rl_critic_gets_its_own_observation_if_asymmetric(asymmetric_critic, column):
-    env = PushTask(4, episode_length=50)
-    env.reset()
-    adapter = RslRlVecEnv(env, metrics_every=4)
-    config = rsl_rl_config(dataclasses.replace(SMALL, asymmetric_critic=asymmetric_critic), 1, 0)
-    algorithm = OnPolicyRunner(adapter, config, log_dir=None, device="cpu").alg
-    obs = adapter.get_observations()
-    assert torch.equal(obs["critic"], env.critic_obs)
-    assert (algorithm.actor.obs_dim, algorithm.critic.obs_dim) == (2, 3 if asymmetric_critic else 2)
-    with torch.inference_mode():
-        before = algorithm.actor(obs), algorithm.critic(obs)
-        obs["critic" if asymmetric_critic else "actor"][:, column] += 1.0
-        assert torch.equal(algorithm.actor(obs), before[0]) == asymmetric_critic
-        assert not torch.equal(algorithm.critic(obs), before[1])
 
 
 def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():

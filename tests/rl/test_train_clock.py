@@ -4,10 +4,9 @@ import dataclasses
 import time
 
 import pytest
-import torch
-from test_train import final_state
 
 from jumper_warp.rl.runner import train
+from test_train import final_state
 from toy_task import SMALL, PushTask, push_cfg
 
 
@@ -59,28 +58,3 @@ def test_remaining_time_follows_iteration_time_and_time_limit(cfg, monkeypatch, 
         train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103")]
     assert line.endswith(f", {left} left")
-
-
-WAITING = ", or restart with OMP_NUM_THREADS=1, since torch's threads wait for them"
-
-
-@pytest.mark.parametrize(
-    ("threads", "expected", "advice"),
-    [(2, 66.0, [f"close other programs that use the cores{WAITING}"]),
-     (1, 66.0, ["close other programs that use the cores"]), (2, 63.0, [])],
-)  # fmt: skip
-def test_low_step_rate_is_reported_once_in_the_first_iteration(cfg, monkeypatch, capsys, threads, expected, advice):
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    slowed = dataclasses.replace(cfg, max_iterations=4, log_interval=3)
-    train_clocked(monkeypatch, slowed, [1.0] * 4 * 16, expected_rate=expected)  # 32 steps of all worlds per second
-    usual = f"slow: below 33 steps/s, {expected:.0f} are usual on two cores"
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith(("slow", "measured"))]
-    assert lines == [*(f"{usual}; {words}" for words in advice), "measured speed: 32 steps/s, about 48 s left"]
-
-
-def test_speed_after_a_short_first_iteration_is_measured_in_the_second(cfg, monkeypatch, capsys):
-    timed = dataclasses.replace(cfg, max_iterations=4, log_interval=3)
-    train_clocked(monkeypatch, timed, [0.25] * 16 + [0.125] * 48, expected_rate=513.0)  # 512 steps in 4 s, then in 2 s
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[1] == "measured speed: 256 steps/s, about 4 s left" and lines[2].startswith("slow: below 256 steps/s")
-    assert lines[3].startswith("iteration 3/4, ") and not any("measured" in line for line in lines[3:])

@@ -81,14 +81,3 @@ def test_stops_of_lateral_outer_and_transversal_sum(description):
 
 def test_default_pose_has_transversals_at_45_degrees(description):
     assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
-
-
-def test_default_description_is_cached_and_read_only():
-    default = load_description()
-    assert load_description() is default and load_description(default.path) is not default
-    meshes = [shape.mesh for link in default.links for shape in link.visuals if shape.mesh]
-    for array in (default.links[0].inertia, default.joints[0].axis, default.loops[0].child_anchor, meshes[0].vertices):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
-    with pytest.raises(TypeError):
-        default.poses["default"] = (0.0, 0.0)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from columns import Z
-from jumper_warp.cli.main import main
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, load_description
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.model import build_model
@@ -16,7 +15,6 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.assets import ASSETS
-from jumper_warp.utils.errors import InputError
 from support.pinocchio_model import build_pinocchio
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -173,23 +171,3 @@ def test_overlay_changes_masses_motors_friction_and_springs(tmp_path):
     pull = 1000.0 * (length - 0.17)  # [N]
     outer = model.joint("FL_outer").dofadr[0]
     assert data.qfrc_spring[outer] == pytest.approx(-pull * 0.175 * math.cos(math.pi / 4), rel=1e-6)  # [N m]
-
-
-def test_command_names_the_values_that_a_format_cannot_hold(tmp_path, capsys):
-    RobotOverlay({"latency": (0.01,), "base_mass": (7.0,)}).save(tmp_path / "robot.json")
-    main(
-        ["export", "robot", "--format", "urdf", "--out", str(tmp_path / "out"), "--robot", str(tmp_path / "robot.json")]
-    )
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-2].endswith(": latency") and lines[-1] == str(tmp_path / "out" / "jumper.urdf")
-    heavier = build_pinocchio(values=RobotOverlay({"base_mass": (7.0,)}).robots()).model
-    masses = [float(mass.get("value")) for mass in ElementTree.parse(lines[-1]).iter("mass")]
-    assert sum(masses) == pytest.approx(sum(inertia.mass for inertia in heavier.inertias))
-    assert sum(masses) == pytest.approx(14.5 + 0.57)  # [kg]
-
-
-def test_solver_refuses_to_write_a_robot_with_open_loops(tmp_path):
-    file = tmp_path / "robot.xml"
-    with pytest.raises(InputError, match="jumper export robot"):
-        mujoco_solver(build_model(1, visuals=False, device="cpu"), save_to_mjcf=str(file))
-    assert not file.exists()

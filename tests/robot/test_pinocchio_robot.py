@@ -53,17 +53,6 @@ def test_configuration_closes_the_loops(moving, robot):
     assert robot.loop_gap(moving[0]) < 1e-12
 
 
-def test_configuration_refuses_knees_out_of_reach(robot):
-    shank = robot.constraints[1].joint1_placement
-    original = shank.translation.copy()
-    shank.translation = np.array([0.0, 0.0, -0.15])  # the knees are 0.3375 m apart
-    try:
-        with pytest.raises(ValueError, match="knees of FR"):
-            robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, 45.0, 45.0]), 4))
-    finally:
-        shank.translation = original
-
-
 def test_closed_velocity_matches_differences_of_configurations(moving, robot):
     q, v = moving
     step = 1e-6  # [s]

@@ -5,7 +5,6 @@ import pytest
 
 from ground_helpers import heights, probe
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile, terrain_map, tile_heights
-from jumper_warp.utils.errors import InputError
 
 CFG = TerrainCfg(rows=2, tile=4.0, cell=0.1, start=0.5, border=1.0)
 NODES = 41  # along an edge of 4 m
@@ -71,20 +70,3 @@ def test_single_tile_has_full_difficulty():
     field = single_tile(CFG, "stairs")
     np.testing.assert_allclose(heights(field), tile("stairs"), atol=1e-6)
     assert (field.hx, field.hy) == (2.0, 2.0)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"rows": -1}, {"tile": 0.0}, {"cell": 0.5}, {"start": 4.0}, {"slope": 70.0}, {"step": (0.1, 0.05)},
-     {"uneven": -0.1}, {"border": float("inf")}],
-)  # fmt: skip
-def test_refuses_impossible_map(settings):
-    with pytest.raises(InputError, match="terrain"):
-        TerrainCfg(**settings)
-
-
-def test_refuses_map_without_rows_and_unknown_kinds():
-    with pytest.raises(InputError, match="at least one row"):
-        terrain_map(TerrainCfg.none())
-    with pytest.raises(InputError, match="terrain must be one of flat, uneven"):
-        single_tile(CFG, "swamp")

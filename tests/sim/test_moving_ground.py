@@ -341,27 +341,6 @@ def test_refuses_blocks_on_mujoco_and_reset_without_blocks():
         plain.reset_blocks()
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"mass": 0.0}, "mass must be positive"),
-        ({"half": (0.4, -0.1)}, "half must be positive"),
-        ({"height": float("nan")}, "height must be positive"),
-        ({"friction": -0.1}, "friction must not be negative"),
-        ({"center": (np.inf, 0.0)}, "center must be finite"),
-    ],
-)
-def test_refuses_impossible_blocks(values, message):
-    with pytest.raises(ValueError, match=message):
-        BlockCfg(**({"center": (0.0, 0.0)} | values))
-
-
-def test_block_values_need_one_row_per_world():
-    model = build_model(2, visuals=False, device="cpu")
-    with pytest.raises(ValueError, match="each of 2 worlds"):
-        SolverJumper(model, block=BlockCfg(center=(0.0, 0.0), mass=np.array([5.0, 5.0, 5.0])))
-
-
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
 def test_new_episode_resets_the_block_and_a_loaded_state_restores_it(begin):
     block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)

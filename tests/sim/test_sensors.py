@@ -144,15 +144,6 @@ def test_no_ground_means_no_rows():
     assert robots.contacts.rigid_contact_count.numpy()[0] == 0 and not force.any()
 
 
-def test_contacts_that_are_too_small_are_refused():
-    robots = Robots("jumper")
-    small = newton.Contacts(4 * N - 1, 0, device="cpu")
-    with pytest.raises(ValueError, match="contacts must hold 8 rows"):
-        robots.solver.update_contacts(small, robots.state)
-    with pytest.raises(ValueError, match="needs the state"):
-        robots.solver.update_contacts(robots.contacts)
-
-
 def test_block_counts_as_ground():
     model = build_model(1, visuals=False, device="cpu")
     state, contacts = model.state(), newton.Contacts(4, 0, device="cpu")

@@ -8,10 +8,6 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from columns import COORDS, DOFS, LIN_VEL, MOTOR_DOFS, X, Z
-from jumper_warp.robot.model import build_model
-from jumper_warp.sim.dynamics import NotThisRobotError
-from jumper_warp.sim.solver import SolverJumper
-from jumper_warp.utils.errors import InputError
 from simulation_helpers import simulation
 from solver_helpers import BODIES, KNEE_V
 
@@ -45,66 +41,10 @@ def trajectory(sim, steps=30):
     return np.array(motion)
 
 
-def test_refuses_model_of_another_robot():
-    builder = newton.ModelBuilder()
-    body = builder.add_body(label="box")
-    builder.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1)
-    with pytest.raises(NotThisRobotError, match="labels"):
-        SolverJumper(builder.finalize(device="cpu"))
-
-
-@pytest.mark.parametrize("labels", ["body_label", "joint_label"])
-def test_refuses_robot_with_another_label(labels):
-    model = build_model(2, visuals=False, device="cpu")
-    getattr(model, labels)[30] = "world_1/wheel"
-    with pytest.raises(NotThisRobotError, match="'wheel'"):
-        SolverJumper(model)
-
-
-def test_refuses_robot_without_a_paw():
-    model = build_model(1, visuals=False, device="cpu")
-    index = next(i for i, label in enumerate(model.shape_label) if label.endswith("BL_paw"))
-    model.shape_label[index] = "world_0/BL_wheel"
-    with pytest.raises(NotThisRobotError, match="BL_paw"):
-        SolverJumper(model)
-
-
-@pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0), ("tolerance", float("nan"))])
-def test_refuses_bad_settings(argument, value):
-    with pytest.raises(ValueError, match=argument):
-        SolverJumper(build_model(1, visuals=False, device="cpu"), **{argument: value})
-
-
-BAD_DT = [0.0, -DT, float("nan"), float("inf")]
-BAD_SUBSTEPS = [0, -1, 1.5, float("nan")]
-
-
-@pytest.mark.parametrize("dt", BAD_DT)
-def test_refuses_bad_dt_without_side_effects(pair, dt):
-    sim, _ = pair
-    before = sim.joint_q().copy()
-    with pytest.raises(ValueError, match="dt must be"):
-        sim.solver.step(sim.state, sim.state, None, None, dt)
-    with pytest.raises(ValueError, match="dt must be"):
-        sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, dt, 1)
-    assert np.array_equal(sim.joint_q(), before)
-
-
-@pytest.mark.parametrize("substeps", BAD_SUBSTEPS)
-def test_refuses_bad_substeps(pair, substeps):
-    sim, _ = pair
-    before = sim.joint_q().copy()
-    with pytest.raises(ValueError, match="substeps must be"):
-        sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, DT, substeps)
-    assert np.array_equal(sim.joint_q(), before)
-
-
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
 @pytest.mark.parametrize(
-    ("argument", "value"),
-    [*(("dt", dt) for dt in BAD_DT), *(("substeps", n) for n in BAD_SUBSTEPS), ("tolerance", 0.0), ("tolerance", -1.0),
-     ("tolerance", float("nan")), ("tolerance", float("inf"))],
-)  # fmt: skip
+    ("argument", "value"), [("dt", float("nan")), ("dt", -DT), ("substeps", 0), ("tolerance", float("inf"))]
+)
 def test_simulation_refuses(solver, argument, value):
     with pytest.raises(ValueError, match=f"{argument} must be"):
         simulation(1, solver=solver, **{argument: value})
@@ -277,60 +217,3 @@ def test_body_accelerations_are_observable_and_joint_forces_are_not():
 
 
 # ---------------------------------------------------------------- arrays of another model
-
-
-def parts(num_worlds):
-    """Return a simulation and the arguments of a step of its solver by name."""
-    sim = simulation(num_worlds)
-    arguments = {"state_in": sim.state, "state_out": sim.model.state(), "control": sim.control, "motors": sim.motors}
-    arguments |= {name: wp.clone(sim.target) for name in ("target", "previous")}
-    return sim, arguments | {"delay": wp.zeros(num_worlds, dtype=int, device="cpu")}
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("state_in", r"state_in\.body_f must have shape \(63,\) on cpu, for 3 worlds .*, got \(21,\) on cpu$"),
-        ("state_out", r"state_out\.joint_q must have shape \(129,\)"),
-        ("control", r"control\.joint_f must have shape \(114,\)"),
-        ("motors", r"motors\.kp must have shape \(12, 3\)"),
-        ("target", r"target must have shape \(12, 3\)"),
-        ("previous", r"previous must have shape \(12, 3\)"),
-        ("delay", r"delay must have shape \(3,\)"),
-    ],
-)
-def test_refuses_arrays_of_a_model_with_fewer_worlds(name, message):
-    sim, arguments = parts(3)
-    arguments[name] = parts(1)[1][name]
-    with pytest.raises(InputError, match=message):
-        sim.solver.step_motors(dt=DT, substeps=1, **arguments)
-    if name in ("state_in", "state_out", "control"):
-        with pytest.raises(InputError, match=message):
-            sim.solver.step(*(arguments[each] for each in ("state_in", "state_out", "control")), None, DT)
-
-
-@pytest.mark.parametrize("worlds", [(-1, 1), (0, 4), (3, 1), (2, -1)])
-def test_refuses_a_range_beyond_the_worlds(worlds):
-    sim, arguments = parts(3)
-    with pytest.raises(InputError, match="worlds must be in a range of 3 worlds, got"):
-        sim.solver.step_motors(dt=DT, substeps=1, worlds=worlds, **arguments)
-
-
-def test_refuses_coordinates_or_accelerations_of_another_model():
-    sim, other = simulation(3), simulation(1)
-    state = sim.model.state()
-    state.joint_qd = other.state.joint_qd
-    with pytest.raises(InputError, match=r"state_in\.joint_qd must have shape \(114,\)"):
-        sim.solver.step(state, sim.state, None, None, DT)
-    sim.state.body_qdd = wp.zeros(21, dtype=wp.spatial_vectorf, device="cpu")
-    with pytest.raises(InputError, match=r"body_qdd must have shape \(63,\)"):
-        sim.solver.step(sim.model.state(), sim.state, None, None, DT)
-
-
-def test_reset_and_contacts_refuse_a_state_of_another_model():
-    sim, state = simulation(3), simulation(1).state
-    with pytest.raises(InputError, match=r"state\.joint_q must have shape \(129,\)"):
-        sim.solver.reset(state)
-    contacts = newton.Contacts(rigid_contact_max=12, soft_contact_max=0, device="cpu")
-    with pytest.raises(InputError, match=r"state\.body_q must have shape \(63,\)"):
-        sim.solver.update_contacts(contacts, state)

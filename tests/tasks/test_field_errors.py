@@ -10,7 +10,6 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import module_from_file
 
 STEPS = "    steps: int  # policy steps since the episode began\n"
-SET = "    new = state\n    new.goal = values[0]\n    new.age = 0\n    new.lasts = 0\n    return new\n"
 
 
 @pytest.fixture
@@ -35,12 +34,9 @@ def make(tmp_path, monkeypatch):
         ("new.near =", "new.nera =", "advance_hold: unknown field 'nera'; did you mean 'near'?"),
         ("robot.height - state.goal, w", "robot.heigth, w",
          "near_goal: RobotView has no field 'heigth'; did you mean 'height'?"),
-        ("state.near >=", "state.x >=", "held: HoldState has no field 'x'; it has goal, steps, age, lasts, near"),
         ("robot.torque_ratio", "robot.torqe_ratio",
          "weak_motors: RobotParameters has no field 'torqe_ratio'; did you mean 'torque_ratio'?"),
-        ("return state.goal", "return robot.lin_vel.q", "wanted_height: unknown field 'q'"),
         ("level.goal = ", "level.gaol = ", "values: unknown field 'gaol'; did you mean 'goal'?"),
-        ("settings.heading, ", "settings.heeding, ", "values: unknown field 'heeding'; did you mean 'heading'?"),
     ],
 )  # fmt: skip
 def test_unknown_field_is_refused_with_its_place_and_similar_fields(right, wrong, message, make):
@@ -54,34 +50,13 @@ def test_unknown_field_is_refused_with_its_place_and_similar_fields(right, wrong
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
-        (SET, SET.replace("    return new\n", ""),
-         "own_faults.py:99: hold-height command.set give_hold: the function must return HoldState, it returns nothing"),
-        ("    new.lasts = settings.lasts\n    return new\n", "",
-         "own_faults.py:86: hold-height reset reset_hold: the function must return HoldState, it returns nothing"),
-        ("return state.lasts > 0 and state.age >= state.lasts", "state.age = 0",
-         "own_faults.py:109: hold-height command.resample_due another_goal_due: the function must return bool,"),
         ("    return True", "    return 1.0", "own_faults.py:135, function every_episode: The function"),
-        ("< tolerance, state.near + 1, 0)\n    return new", "< tolerance, state.near + 1, 0)",
-         "own_faults.py:76: Advance advance_hold: the function must return the state, it returns nothing"),
         ("values: wp.vec4", "values: wp.vec3",
          "own_faults.py:99: give_hold must take (RobotView, Scene, HoldState, a vector of 4, float32)"),
-        ("values: wp.vec4, heading: float", "values: wp.vec4",
-         "command.set give_hold: the function must have 5 arguments (RobotView, Scene, HoldState, "),
-        ("robot: mdp.RobotParameters, rng: mdp.RngStream,", "robot: mdp.RobotParameters, rng: mdp.Scene,",
-         "EventTerm weak_motors: argument 2 of weak_motors is Scene, the task has RngStream"),
         ("mdp.rewards.psi(robot", "mdp.rewards.psy(robot", "own_faults.py:141, function near_goal: Could not find"),
         (STEPS, "", "own_faults.py:16: the state HoldState of hold-height needs a field steps: int"),
-        (STEPS, STEPS.replace("int", "float"), "HoldState of hold-height needs a field steps: int"),
-        ("        return level", "        pass", "values of HoldLevelCfg must return HoldLevel, it returns NoneType"),
         ("    struct = HoldLevel\n", "", "levels[0]: HoldLevelCfg must have the attributes struct and values()"),
         ("(10.0, 40.0)", "15.0", "hold-height: action_scale must be (float, float), got 15.0"),
-        ("(10.0, 40.0)", '(10.0, "40")', "hold-height: action_scale must be (float, float), got (10.0, '40')"),
-        ("reward_floor=None", "reward_floor='0'", "hold-height: reward_floor must be float or None, got '0'"),
-        ("events=(mdp.EventTerm(weak_motors, lower=0.8, upper=1.0),)",
-         "events=mdp.EventTerm(weak_motors, lower=0.8, upper=1.0)", "events must be (EventTerm, ...), got EventTerm("),
-        ("HoldLevelCfg((0.22, 0.42))", "HoldLevelCfg(0.22)", "levels goal must be (float, float), got 0.22"),
-        ("mdp.Reset(reset_hold,", "mdp.Reset(hold_height,", "reset func must be a @wp.func, got <function hold_height"),
-        ("state=HoldState", "state=HoldLevelCfg", "hold-height: state must be a @wp.struct, got <class"),
     ],
 )  # fmt: skip
 def test_own_fault_is_refused_by_the_task_in_one_line(right, wrong, message, make):

@@ -9,7 +9,6 @@ import torch
 import warp as wp
 
 from columns import ANG_VEL, LIN_VEL, POS, QUAT
-from jumper_warp.kernels.mdp import observations as obs
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
@@ -147,11 +146,3 @@ def test_only_columns_that_are_mirrored_as_legs_have_names_of_legs():
 
     assert ends() == ends(mirror=(1, -2, 3, -4)) == ["x", "y", "z", "w"]
     assert ends(mirror=(2, 1, 4, 3)) == ["FL", "FR", "BL", "BR"]
-
-
-def test_refuses_a_term_without_a_known_mirror_image():
-    asymmetric = dataclasses.replace(
-        make_task("velocity-flat"), observations=ObservationsCfg(actor=(), critic=(ObservationTerm(obs.drawn_push),))
-    )
-    with pytest.raises(InputError, match="mirror image of drawn_push is not known"):
-        mirror_of(asymmetric, "critic")

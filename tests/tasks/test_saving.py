@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import sys
 from typing import Any
 
@@ -13,7 +12,7 @@ import hold_height
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.tasks.saving import MAX_ENTRIES, OPTIONAL, TaskError, json_value, name_of, task_from_json, task_to_json
+from jumper_warp.tasks.saving import OPTIONAL, TaskError, name_of, task_from_json, task_to_json
 from jumper_warp.tasks.terms import RewardTerm
 
 JUMP = "jumper_warp.kernels.jump"
@@ -61,21 +60,6 @@ def test_function_of_a_user_is_not_confused_with_the_projects_of_the_same_name()
     assert functions["base_at_rest"] is base_at_rest and base_at_rest is not rewards.base_at_rest
 
 
-def test_functions_of_a_loaded_but_not_passed_module_are_refused():
-    assert sys.modules["hold_height"] is hold_height
-    content = saved(make_task("vertical-jump"))
-    content["rewards"][0]["func"] = "hold_height:near_goal"
-    with pytest.raises(TaskError, match="pass the file that defines it with --task-module"):
-        task_from_json(content, [THIS])
-
-
-def test_refusal_reports_that_a_passed_module_lacks_the_function():
-    content = saved(jump_with_user_reward())
-    content["rewards"][9]["func"] = f"{__name__}:sleep"
-    with pytest.raises(TaskError, match="no such function or type"):
-        task_from_json(content, [THIS])
-
-
 def test_sections_for_training_can_be_left_out_with_their_functions():
     task, content = jump_with_user_reward(), saved(jump_with_user_reward())
     content["observations"]["critic"][0]["func"] = content["rewards"][0]["func"] = "elsewhere:unknown"
@@ -117,51 +101,18 @@ def test_function_of_main_is_saved_under_the_stem_of_its_file(monkeypatch):
     assert name_of(base_at_rest) == "my_task:base_at_rest"
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Settings with one value of any type."""
-
-    value: Any = 1.0
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, {"a": 1.0}, [1.0], b"x", object()])
-def test_setting_that_json_cannot_restore_is_not_saved(value):
-    with pytest.raises(TaskError):
-        json_value(Settings(value))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda t: t.update(version=4), "the task has version 4, expected version 5; commit 7f5b55c3 reads version 4"),
-        (lambda t: t.pop("version"), "the task has version None, expected version 5; commit 7f5b55c3"),
         (lambda t: t.update(evaluation={"type": "jumper_warp.robot.motors:LimitsCfg"}), "expected .* an? Evaluation"),
         (lambda t: t["observations"]["actor"][0].update(mirror=[2]), "wanted_height: mirror must have 1 to 1"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
-        (lambda t: t["rewards"][3].pop("weight"), r"task.rewards\[3\]: a reward needs a weight"),
         (lambda t: t["rewards"][0].update(fin=0.1), r"task.rewards\[0\]: .* unknown parameter 'fin'"),
-        (lambda t: t["rewards"][0].pop("std_fine"), r"task.rewards\[0\]: .* parameter 'std_fine' is missing"),
-        (lambda t: t["rewards"][0].update(name="a\nb"), "a name may contain letters"),
-        (lambda t: t["rewards"][0].update(scale_by_dt=2), r"task.rewards\[0\].scale_by_dt: expected bool, got 2"),
-        (lambda t: t["rewards"][0].update(weight=10**400), r"weight: must be finite, got a huge integer"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.state:JumpState"), "is not a @wp.func"),
-        (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.rewards:wp"), "no such function or type"),
-        (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.none:f"), "no such function or type"),
-        (lambda t: t["rewards"][0].update(func="jumper_warp.cli.main:parse"), "no such function or type"),
         (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:landed_for", steps=1.0), "must return float"),
-        (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
-        (lambda t: t["observations"]["actor"][0].update(history=10**9), "history must be at most"),
-        (lambda t: t["advance"].update(func="jumper_warp.kernels.mdp.view:load_view"), "must be annotated RobotView"),
-        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:NoSettings"), "NoSettings of .* needs a field steps"),
-        (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),
-         r"levels\[6\]: .* must have the attributes struct and values"),
-        (lambda t: t.update(levels=t["levels"] * MAX_ENTRIES), f"expected at most {MAX_ENTRIES} entries"),
-        (lambda t: t["reset"].update(settings={"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0, "upper": 1}),
-         "must have the attributes struct and values"),
-        (lambda t: t["curriculum"].update(counts=None), "expected module:name, got None"),
         (lambda t: t.update(randomization={"gains": [0.5]}), "task.randomization.gains: expected 2 entries, got 1"),
-        (lambda t: t["randomization"].update(resample_at="never"), "task.randomization.resample_at: must be one of"),
     ],
 )  # fmt: skip
 def test_changed_json_that_is_no_task_is_refused(change, message):
@@ -175,24 +126,3 @@ def test_missing_setting_has_its_default():
     content = saved(make_task("vertical-jump"))
     del content["contact_force"], content["curriculum"]["promote_after"], content["reset"]["settings"]["tilt"]
     assert task_from_json(content) == make_task("vertical-jump")
-
-
-def nested(levels):
-    """Return lists and objects nested in turn, `levels` deep, around 1.0."""
-    value: Any = 1.0
-    for i in range(levels):
-        value = [value] if i % 2 else {"type": value}
-    return value
-
-
-@pytest.mark.parametrize("content", [None, [], "task", 3, math.nan, {}, {"version": 3}, nested(200), {"version": [2]}])
-def test_json_without_version_or_fields_is_refused(content):
-    with pytest.raises(TaskError):
-        task_from_json(content)
-
-
-def test_state_of_another_task_is_refused():
-    content = saved(hold_height.hold_height())
-    content["state"] = "jumper_warp.kernels.jump.state:JumpState"
-    with pytest.raises(TaskError, match="is HoldState, the task has JumpState"):
-        task_from_json(content, [hold_height])

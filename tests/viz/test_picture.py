@@ -1,19 +1,12 @@
 """Composite pictures of hand-made jumps and walks."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from PIL import Image
-from scipy import ndimage
 
-from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
-from columns import XY, X, Y, Z
-from jumper_warp.evaluation.recorder import save_recording
-from jumper_warp.utils.errors import InputError
+from box_robot import GREEN, RATE, STANDING, box_recording, pinhole, walk
+from columns import XY, X, Z
 from jumper_warp.viz import picture
 from jumper_warp.viz.picture import GAP, MOST, SIDE_BY_SIDE, SPREAD, compose, write_picture
-from jumper_warp.viz.props import with_blocks
 
 GRAVITY = 9.81  # [m/s²]
 SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST = 12, 20, 44, 68, 88  # frames of `jump`
@@ -65,15 +58,6 @@ def test_horizontal_jump_keeps_its_places_and_runs_to_the_right(heading):
     assert distance[~np.eye(len(distance), dtype=bool)].min() >= GAP - 1e-6  # [m]
 
 
-@pytest.mark.parametrize(("distance", "heading", "shown"), [(0.3, 1.5, 1.5), (0.1, 1.5, 0.0), (0.3, 3.0, 3.0)])
-def test_short_jump_is_spread_in_its_direction_and_a_drift_is_not(distance, heading, shown):
-    positions, forces = jump(distance)
-    turned = np.array([[np.cos(heading), np.sin(heading), 0.0], [-np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
-    scene = compose(box_recording(positions @ turned, forces=forces))
-    assert scene.right == pytest.approx([np.cos(shown), np.sin(shown), 0.0], abs=1e-6)
-    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
-
-
 @pytest.mark.parametrize(
     ("distance", "goal", "eye", "spread"),
     [
@@ -100,49 +84,6 @@ def test_each_of_two_jumps_in_a_row_has_its_apex():
     assert {APEX, second + APEX} <= set(scene.frames)
 
 
-@pytest.mark.parametrize("drift", [0.0, 0.1])  # [m] a hop
-def test_hops_in_place_show_the_first_and_then_apexes_over_time_without_their_path(drift):
-    positions, forces = jump(drift)
-    hops = np.concatenate([positions + [drift * i, 0.0, 0.0] for i in range(8)])
-    scene = compose(box_recording(hops, forces=np.tile(forces, 8)))
-    hop = REST + 1
-    assert list(scene.frames[:3]) == [TAKEOFF, APEX, TOUCHDOWN] and len(scene.frames) == MOST
-    assert [(frame - APEX) / hop for frame in scene.frames[3:-1]] == [1, 4, 7]
-    assert scene.frames[-1] == 8 * hop - 1
-    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
-    axis, *_ = (line.points for line in picture._lines(scene))
-    assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, Z] == pytest.approx(scene.lowest)
-    assert all(len(line.points) == 2 for line in picture._lines(scene))  # no arrow: moments are not to scale
-    assert "time, not\nto scale" in [label.text for label in picture._labels(scene)]
-    times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
-    assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
-    assert all(label.point[Z] < scene.lowest for label in times)
-
-
-def test_jumps_ahead_are_shown_to_the_end():
-    positions, forces = jump(0.4)
-    hops = np.concatenate([positions + [0.4 * i, 0.0, 0.0] for i in range(12)])
-    scene = compose(box_recording(hops, forces=np.tile(forces, 12)))
-    assert {0, len(hops) - 1} <= set(scene.frames) and len(scene.frames) == MOST
-
-
-@pytest.mark.parametrize("distance", [0.0, 1.5])
-def test_front_view_shows_the_robots_side_by_side(distance):
-    scene = compose(jump_recording(distance), eye=(3.0, 0.0, 0.5))
-    assert scene.right == pytest.approx([0.0, 1.0, 0.0]) and scene.toward_eye == pytest.approx([1.0, 0.0, 0.0])
-    assert np.diff(scene.bases[:, Y]) == pytest.approx(SPREAD) and len(scene.frames) == 7
-    axis, *_ = (line.points for line in picture._lines(scene))
-    assert axis[:, X].min() > scene.bases[:, X].max()  # in front of all robots
-
-
-@pytest.mark.parametrize("height", np.arange(0.35, 1.0, 0.05))
-def test_labels_of_robots_are_not_on_the_bar_of_the_commanded_height(height):
-    scene = compose(jump_recording(heights=np.array([height], np.float32)))
-    for label in picture._labels(scene):
-        if label.anchor == "md":
-            assert not label.point[Z] - 0.02 < height < label.point[Z] + 0.12
-
-
 def test_lifted_paws_without_rise_are_no_jump():
     forces = np.full(61, 100.0)
     forces[10:20] = 0.0  # a trot with a flight phase
@@ -155,22 +96,6 @@ def test_moments_of_a_walk_are_side_by_side(distance, moments):
     gaps = np.diff(scene.bases[:, X])
     assert len(scene.frames) == moments and not scene.shift.any()
     assert gaps.min() >= min(SIDE_BY_SIDE, 0.95 * distance) - 0.05 and gaps.max() < 1.1 * gaps.min()
-
-
-@pytest.mark.parametrize(("distance", "hides"), [(0.0, False), (0.7, True), (1.5, True)])
-def test_apex_is_opaque_and_moments_that_would_hide_others_are_not(distance, hides):
-    positions, forces = jump(distance, gravity=4.0)  # [m/s²] low: takeoff and touchdown are near the apex
-    scene = compose(box_recording(positions, forces=forces))
-    opacity = picture._opacity(scene)
-    assert opacity[list(scene.frames).index(APEX)] == 1.0
-    assert (opacity < 1.0).any() == hides
-
-
-def test_moments_are_drawn_at_their_places(tmp_path):
-    path = write_picture(jump_recording(), tmp_path / "jump.png", width=640)
-    with Image.open(path) as image:
-        _, blobs = ndimage.label(ndimage.binary_opening(colored(image, 1), iterations=2))
-    assert blobs == 7
 
 
 def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_path, monkeypatch):
@@ -203,87 +128,3 @@ def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_pat
     assert (pixels > 0.0).all() and (pixels < size).all()
     assert (np.diff(pixels[:-1, 0]) > 0.0).all()  # from left to right
     assert list(compose(recording, 1).heights) == [pytest.approx(0.9)]
-
-
-def test_blocks_move_with_their_world_and_do_not_change_the_moments(tmp_path):
-    positions, forces = jump(1.5)
-    recording = box_recording(np.stack([positions, positions], axis=1), forces=forces)
-    centers = np.tile([1.5, 0.0], (REST + 1, 2, 1))
-    shown = with_blocks(recording, centers, np.full((2, 2), 0.3), np.array([0.1, 0.1]))
-    for rank in (0, 1):
-        np.testing.assert_array_equal(compose(shown, rank).frames, compose(recording, rank).frames)
-        with Image.open(write_picture(shown, tmp_path / "block.png", rank=rank, width=WIDTH)) as image:
-            assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-@pytest.mark.parametrize(("top", "step"), [(0.3, 0.25), (1.4, 0.25), (2.9, 0.5), (5.0, 1.0), (90.0, 16.0)])
-def test_scale_of_heights_has_few_marks_up_to_the_apex(top, step):
-    recording = box_recording(np.stack([[distance, 0.0, top] for distance in (0.0, 1.0)]))
-    marks = picture._ticks(compose(recording))
-    assert np.diff(marks) == pytest.approx(step) and len(marks) <= 8
-    assert marks[0] == 0.0 and top - step < marks[-1] <= top + 0.1
-
-
-@pytest.mark.parametrize("frames", [1, 2, 30])
-def test_robot_that_never_moves_is_shown_once(tmp_path, frames):
-    recording = box_recording(np.tile([1.0, 2.0, STANDING], (frames, 1)))
-    assert list(compose(recording).frames) == [0]
-    with Image.open(write_picture(recording, tmp_path / "still.png", width=WIDTH)) as image:
-        assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-def test_recording_that_ends_in_flight_shows_no_moment_twice():
-    recording = jump_recording()
-    part = {name: getattr(recording, name)[:APEX] for name in ("times", "poses", "contact_points", "contact_forces")}
-    frames = compose(replace(recording, **part)).frames
-    assert len(set(frames)) == len(frames) and frames[-1] == APEX - 1
-
-
-@pytest.mark.parametrize("value", [np.nan, 1.0e9])
-@pytest.mark.parametrize(("distance", "first"), [(0.0, TAKEOFF + 5), (1.5, TOUCHDOWN + 3)])
-def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
-    recording = jump_recording(distance)
-    for values in (recording.poses, recording.contact_points, recording.contact_forces):
-        values[first:] = value
-    assert compose(recording).frames.max() < first
-    with Image.open(write_picture(recording, tmp_path / "lost.png", width=WIDTH)) as image:
-        assert image.size[0] == WIDTH and colored(image, 1).any()
-
-
-def test_recording_without_a_finite_pose_is_refused_in_one_line_and_still_written_for_the_viewer(tmp_path):
-    recording = jump_recording()
-    recording.poses[:] = np.nan
-    with pytest.raises(InputError, match="world_0: no picture, the poses of the first frame are not finite") as error:
-        save_recording(recording, tmp_path, "lost")
-    assert "\n" not in str(error.value) and [file.name for file in tmp_path.iterdir()] == ["lost.rrd"]
-
-
-@pytest.mark.parametrize(("suffix", "kind"), [(".png", "PNG"), (".webp", "WEBP"), (".jpg", "JPEG")])
-def test_file_has_the_format_of_its_suffix_and_the_width(tmp_path, suffix, kind):
-    path = write_picture(jump_recording(1.5), tmp_path / "new" / f"jump{suffix}", width=WIDTH + 1)
-    with Image.open(path) as image:
-        assert (image.format, image.size[0]) == (kind, WIDTH + 1)
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize(
-    ("name", "width"), [("jump.gif", 240), ("jump", 240), ("jump.png", 199), ("jump.png", 8001), ("jump.png", -1)]
-)
-def test_bad_suffix_and_width_are_refused_before_drawing(tmp_path, monkeypatch, name, width):
-    monkeypatch.setattr(picture, "open_renderer", None)
-    with pytest.raises(
-        InputError, match=rf"{name}: a picture needs suffix \.png, \.webp, \.jpg and width 200 to 8000 px"
-    ):
-        write_picture(jump_recording(), tmp_path / name, width=width)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("eye", "toward"), [(None, (0.0, -1.0)), ((4.0, 3.0, 1.0), (0.8, 0.6))])
-def test_eye_is_on_the_right_of_the_path_or_in_a_direction(tmp_path, monkeypatch, eye, toward):
-    views = []
-    framed = picture._framed
-    monkeypatch.setattr(picture, "_framed", lambda *args: views.append(framed(*args)) or views[-1])
-    write_picture(jump_recording(1.5), tmp_path / "jump.png", width=WIDTH, eye=eye)
-    ((view, _),) = views
-    aside = (view.eye - view.target)[:2]
-    assert aside / np.linalg.norm(aside) == pytest.approx(toward, abs=1e-6)

@@ -53,11 +53,6 @@ def test_sweep_marks_the_values_of_the_paper(drawn):
     assert means == [-0.04, 0.04]
 
 
-def test_sweep_of_diverged_and_of_single_jumps_is_plotted(drawn):
-    sweep(drawn, np.full(3, np.nan), np.zeros(3, dtype=bool))
-    sweep(drawn, np.zeros(1), np.ones(1, dtype=bool))
-
-
 def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     error = np.random.default_rng(3).normal(0.0, 0.1, 4000)
     _, axis = plt.subplots()
@@ -67,37 +62,3 @@ def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     low, high = np.ptp(band[np.isclose(band[:, 0], middle), 1]), 2 * 1.96 * 0.1 / np.sqrt(plots.WINDOW[1])
     plt.close()
     assert low == pytest.approx(high, rel=0.3)
-
-
-def test_landings_show_outline_of_a_platform_and_failures(drawn):
-    goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])  # [m]; the second jump fails
-    corners = np.array([[(-1.0, -1.0), (0.4, -1.0), (0.4, 1.0), (-1.0, 1.0)]])
-    (axis,) = drawn(
-        plots.plot_landings, {"platform": (goals, goals + 0.2, good)}, tolerance=0.1, title="", conditions="",
-        outlines={"platform": ("platform, 0.15 m high", corners)},
-    )  # fmt: skip
-    assert axis.get_title(loc="left") == "platform, 0.15 m high" and axis.get_aspect() == 1.0
-    np.testing.assert_allclose(axis.collections[0].get_paths()[0].vertices[:4], corners[0])
-    failed = next(marks for marks in axis.collections if marks.get_label() == "failed")
-    np.testing.assert_allclose(failed.get_offsets(), [(1.4, 0.3)])  # its landing, 0.2 m off along x and y
-
-
-def test_legend_is_below_the_axes_and_names_labels_once(drawn):
-    def plot(path):
-        with plots.figure(path, 1, 2, title="Title", conditions="nominal") as axes:
-            for axis in axes:
-                axis.plot([0, 1], [0, 1], label="same")
-                axis.set_xlabel("time [s]")
-
-    axes = drawn(plot)
-    (legend,) = axes[0].figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["same"]
-    assert axes[0].figure.get_suptitle() == "Title\nnominal"
-    assert legend.get_window_extent().y1 <= min(axis.get_tightbbox().y0 for axis in axes) + 1.0
-
-
-def test_plots_have_the_projects_style_and_do_not_change_other_plots(drawn):
-    before = plt.rcParams["axes.grid"], plt.rcParams["font.size"]
-    (top, *_) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
-    assert not top.spines["top"].get_visible() and top.xaxis.label.get_size() == 12.0
-    assert (plt.rcParams["axes.grid"], plt.rcParams["font.size"]) == before

@@ -1,6 +1,5 @@
 """Recordings: frames, NumPy archives and Rerun files, read back by Rerun's own reader."""
 
-import sys
 from collections import defaultdict
 
 import newton
@@ -9,18 +8,13 @@ import pytest
 import warp as wp
 from rerun.chunk import RrdReader
 
-from box_robot import box_recording, walk
 from columns import X, Z
-from jumper_warp.robot.model import build_model
 from jumper_warp.viz.recorder import Recorder
-from jumper_warp.viz.recording import Recording, RecordingError, load_npz
+from jumper_warp.viz.recording import load_npz
 from jumper_warp.viz.rerun import write_rrd
-from jumper_warp.viz.style import LEG_COLORS
 
 HEIGHT, TORQUE = "base/height [m]", "torque/FL_outer [N m]"  # series
 FRAMES = 5  # of `record`, 0.02 s apart
-REVERSED = ("BR", "BL", "FR", "FL")
-LEGS = [LEG_COLORS[leg] for leg in reversed(REVERSED)]
 
 
 @pytest.fixture(scope="module")
@@ -84,15 +78,6 @@ def test_recorder_keeps_bodies_and_shapes_of_the_chosen_world(model):
     assert {shape.name: shape.body for shape in recording.shapes} == bodies
 
 
-def test_frames_are_copies_of_the_state(model):
-    state = model.state()
-    recorder = Recorder(model)
-    for frame in range(2):
-        state.body_q.assign(frame_poses(frame).astype(np.float32))
-        recorder.record(float(frame), state.body_q)
-    assert recorder.recording().poses[:, 0, 2] == pytest.approx([0.0, 0.1])
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".anything"])
 def test_npz_restores_the_recording(model, tmp_path, suffix):
     path = tmp_path / f"run{suffix}"
@@ -109,12 +94,6 @@ def test_npz_restores_the_recording(model, tmp_path, suffix):
         assert (shape.name, shape.body, shape.color) == (original.name, original.body, original.color)
         np.testing.assert_array_equal(shape.vertices, original.vertices)
         np.testing.assert_array_equal(shape.triangles, original.triangles)
-
-
-def test_npz_holds_no_pickles(model, tmp_path):
-    record(model).save_npz(tmp_path / "run.npz")
-    with np.load(tmp_path / "run.npz", allow_pickle=False) as archive:
-        assert all(archive[name].dtype != object for name in archive.files)
 
 
 def test_rrd_has_each_bodys_pose_in_each_frame(model, tmp_path):
@@ -141,18 +120,6 @@ def test_rrd_has_each_shape_once_below_its_body(model, tmp_path):
     assert box["Mesh3D:albedo_factor"] == [(None, [0xFF0000FF])]  # red, opaque
 
 
-def test_rrd_draws_and_moves_every_link_of_the_robot(tmp_path):
-    robot = build_model(1, device="cpu")
-    recorder = Recorder(robot)
-    recorder.record(0.0, robot.state().body_q)
-    entities = rows(recorder.save_rrd(tmp_path / "run.rrd"))
-    links = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
-    bodies = {f"{leg}_{link}" for leg in ("FL", "FR", "BL", "BR") for link in links} | {"body"}
-    moving = {entity.split("/")[3] for entity, columns in entities.items() if "Transform3D:quaternion" in columns}
-    parts = [entity.split("/") for entity in entities if entity.startswith("/scene/world_0/")]
-    assert moving == {part[3] for part in parts if len(part) == 5} == bodies  # "", scene, world, link, shape
-
-
 def test_rrd_has_the_series_and_forces(model, tmp_path):
     entities = rows(record(model, worlds=(0, 1)).save_rrd(tmp_path / "run.rrd"))
     torque = sorted(entities[r"/series/torque/outer\ \[N\ m\]"]["Scalars:scalars"])
@@ -163,62 +130,6 @@ def test_rrd_has_the_series_and_forces(model, tmp_path):
     assert len(vectors) == FRAMES
     assert origins[2][1] == [[9, 10, 11], [12, 13, 14], [15, 16, 17]]  # [m] of world 1
     assert np.array(vectors[2][1]) == pytest.approx(np.full((3, 3), 0.2))  # 200 N at 1 mm/N
-
-
-def blueprint(path):
-    """Return {component: [value, ...]} of all entities of a Rerun file's blueprint."""
-    reader, values = RrdReader(path), defaultdict(list)
-    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
-        batch = chunk.to_record_batch()
-        for name in (name for name in batch.schema.names if ":" in name):  # components, without times
-            values[name] += batch.column(name).to_pylist()
-    return values
-
-
-def test_rrd_of_a_loaded_recording_is_the_only_new_file_and_has_a_view_of_each_group(model, tmp_path):
-    record(model).save_npz(tmp_path / "run.npz")
-    path = write_rrd(load_npz(tmp_path / "run.npz"), tmp_path / "run.rrd")
-    reader = RrdReader(path)
-    assert len(reader.recordings()) == len(reader.blueprints()) == 1
-    views = [name for (name,) in blueprint(path)["ViewBlueprint:display_name"]]
-    assert sorted(views) == ["base", "scene", "torque outer [N m]"]
-    assert sorted(item.name for item in tmp_path.iterdir()) == ["run.npz", "run.rrd"]
-
-
-def test_rrd_plays_from_the_start_and_its_eye_follows_the_worlds(model, tmp_path):
-    path = record(model, worlds=(0, 1), spacing=1.5).save_rrd(tmp_path / "run.rrd")
-    layout, target = blueprint(path), rows(path)["/scene/view_target"]  # the entity that the eye looks at and follows
-    assert layout["TimePanelBlueprint:play_state"] == [[2]]  # playing; 3 would follow the end
-    assert layout["EyeControls3D:tracking_entity"] == [["/scene/view_target"]]
-    positions = [value[0] for _, value in sorted(target["Transform3D:translation"])]
-    # mean of the bodies at x = 0 and 2 m; heights of 0 to 0.4 m; the second world is drawn 1.5 m to the left
-    assert np.array(positions) == pytest.approx(np.tile([1.0, 0.75, 0.2], (FRAMES, 1)))
-    eye, center = np.array(layout["EyeControls3D:position"]), np.array(layout["EyeControls3D:look_target"])
-    assert center[0, 0] == pytest.approx(positions[0])
-    ends = np.array(target["Mesh3D:vertex_positions"][0][1])  # the viewer's distance is 1.5 times their radius
-    assert np.linalg.norm(eye - center) == pytest.approx(0.75 * np.linalg.norm(ends[1] - ends[0]), rel=1e-3)
-
-
-def test_rrd_shows_a_curve_of_each_leg_in_the_order_and_colors_of_legs(model, tmp_path):
-    recorder = Recorder(model)
-    for frame in range(2):
-        recorder.record(frame, frame_poses(frame), {f"torque/{leg}_inner [N m]": i for i, leg in enumerate(REVERSED)})
-    entities = rows(recorder.save_rrd(tmp_path / "run.rrd"))
-    inner = entities[r"/series/torque/inner\ \[N\ m\]"]
-    assert inner["SeriesLines:names"] == [(None, ["FL", "FR", "BL", "BR"])]
-    assert [value for _, value in inner["Scalars:scalars"]] == [[3.0, 2.0, 1.0, 0.0]] * 2
-    colors = [sum(round(255 * c) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) + 255 for rgb in LEGS]
-    assert inner["SeriesLines:colors"] == [(None, colors)] and len(set(colors)) == 4
-
-
-@pytest.mark.parametrize(
-    ("labels", "names"), [(("0.60 m", "0.90 m"), (r"0.60\ m", r"0.90\ m")), (("0.60 m",) * 2, ("world_0", "world_1"))]
-)
-def test_rrd_names_worlds_by_their_distinct_labels(model, tmp_path, labels, names):
-    entities = rows(record(model, worlds=(0, 1), labels=labels).save_rrd(tmp_path / "run.rrd"))
-    for name in names:
-        assert "Transform3D:quaternion" in entities[f"/scene/{name}/body"]
-        assert "Mesh3D:vertex_positions" in entities[f"/scene/{name}/body/box"]
 
 
 def test_rrd_has_goals_trails_and_the_changes_of_states(model, tmp_path):
@@ -250,87 +161,3 @@ def test_rrd_has_commanded_and_actual_velocity_of_a_turned_base(model, tmp_path)
     for name, velocity in (("commanded", [-0.2, 0.6, 0.0]), ("actual", [1.0, -0.4, 0.0])):  # [m/s]
         arrows = [value for _, value in entities[f"/scene/world_0/{name}_velocity"]["Arrows3D:vectors"]]
         assert np.array(arrows) == pytest.approx(np.tile(0.5 * np.array(velocity), (FRAMES, 1, 1)), abs=1e-5)
-
-
-def test_rrd_without_rerun_fails_in_one_line_and_leaves_no_file(model, tmp_path, monkeypatch):
-    recorder = record(model)
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ImportError, match="pip install rerun-sdk"):
-        recorder.save_rrd(tmp_path / "run.rrd")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 truncated"])
-def test_load_npz_refuses_other_content_by_name(tmp_path, content):
-    path = tmp_path / "run.npz"
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match=r"run\.npz"):
-        load_npz(path)
-
-
-def test_load_npz_refuses_truncated_missing_and_other_archives_by_name(model, tmp_path):
-    path = record(model).save_npz(tmp_path / "run.npz")
-    path.write_bytes(path.read_bytes()[:-200])
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    for bad in (path, tmp_path / "absent.npz", tmp_path / "other.npz"):
-        with pytest.raises(RecordingError, match=bad.name):
-            load_npz(bad)
-
-
-def test_load_npz_of_a_damaged_archive_raises_nothing_but_recording_errors(model, tmp_path):
-    whole = record(model).save_npz(tmp_path / "run.npz").read_bytes()
-    for position in range(40, len(whole), len(whole) // 40):  # of a byte that is inverted
-        damaged = bytearray(whole)
-        damaged[position] ^= 0xFF
-        (tmp_path / "bad.npz").write_bytes(damaged)
-        try:
-            assert isinstance(load_npz(tmp_path / "bad.npz"), Recording)  # the byte is not used
-        except RecordingError:
-            pass
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"time": 0.0}, "time must increase"),
-        ({"time": float("nan")}, "time must increase"),
-        ({"body_poses": np.zeros((3, 7))}, r"shape \(4, 7\)"),
-        ({"series": {"base/height [m]": 1.0}}, "new or missing.*torque"),
-        ({"contact_points": None}, "together, or neither"),
-        ({"contact_points": np.zeros((2, 3)), "contact_forces": np.zeros((2, 3))}, "every frame needs"),
-        ({"contact_forces": np.zeros((4, 3))}, "contacts must have shape"),
-    ],
-)
-def test_record_refuses_a_wrong_frame_and_does_not_keep_it(model, change, message):
-    frame = {"time": 1.0, "body_poses": frame_poses(0), "series": {HEIGHT: 0.0, TORQUE: 0.0}}
-    frame |= {"contact_points": np.zeros((3, 3)), "contact_forces": np.zeros((3, 3))}
-    recorder = Recorder(model)
-    recorder.record(**frame)
-    with pytest.raises(ValueError, match=message):
-        recorder.record(**(frame | {"time": 2.0} | change))
-    recorder.record(**(frame | {"time": 3.0}))
-    recording = recorder.recording()
-    assert len(recording.times) == len(recording.poses) == len(recording.series[HEIGHT]) == 2
-
-
-@pytest.mark.parametrize("name", ["height [m]", "base/height", "base/height []", "a/b/c [m]", "/height [m]"])
-def test_record_refuses_series_without_group_or_unit(model, name):
-    with pytest.raises(ValueError, match="group/quantity"):
-        Recorder(model).record(0.0, frame_poses(0), {name: 1.0})
-
-
-def test_recorder_refuses_a_missing_world_and_an_empty_recording(model):
-    with pytest.raises(ValueError, match="world 2 has no bodies"):
-        Recorder(model, (0, 2))
-    with pytest.raises(ValueError, match="the recording has no frames"):
-        Recorder(model).recording()
-
-
-@pytest.mark.parametrize(
-    ("policy", "task", "words"),
-    [("", "pronk", "pronk"), ("vertical_jump", "vertical-jump", "vertical_jump"), ("mine", "pronk", "mine (pronk)")],
-)
-def test_heading_names_policy_task_and_a_single_world(policy, task, words):
-    notes = {"policy": policy, "task": task} if policy else {"task": task}
-    recording = box_recording(walk(1.0), notes=notes, labels=("0.90 m",))
-    assert recording.heading([0]) == f"{words}   0.90 m" and recording.heading([0, 1]) == words

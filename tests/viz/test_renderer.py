@@ -2,16 +2,13 @@
 
 import math
 import os
-import sys
 
 import numpy as np
 import pytest
 import trimesh
 
 from box_robot import colored, pinhole, shape
-from jumper_warp.utils.errors import InputError
-from jumper_warp.viz import renderer as module
-from jumper_warp.viz.renderer import GLRenderer, Line, RayTracer, View, open_renderer
+from jumper_warp.viz.renderer import GLRenderer, Line, RayTracer, View
 
 SIZE = (96, 64)  # [px] width, height
 RADIUS = 0.2  # [m] of the balls
@@ -78,57 +75,12 @@ def test_drawn_ball_is_where_the_view_projects_it(one_ball, place):
     assert pixel == pytest.approx(pinhole([place], view.eye, view.target, 40.0, SIZE)[0], abs=1e-9)
 
 
-def test_renderers_draw_in_turn_while_others_open_and_close(kind):
-    place, lines = poses((0.0, 0.6, 0.0)), [Line(np.array([[0.0, -0.5, 0.0], [0.0, -0.5, 0.5]]), (0.0, 0.0, 1.0))]
-    with kind([BALL, FIXED], 1, SIZE) as alone:
-        expected = [alone.draw(place, VIEW), alone.draw(place, VIEW, lines)]
-    first, second = kind([BALL], 1, SIZE), kind([BALL, FIXED], 1, SIZE)
-    for _ in range(2):
-        assert not colored(first.draw(poses((0.0, -0.6, 0.0)), VIEW), BLUE).any()
-        np.testing.assert_array_equal(second.draw(place, VIEW), expected[0])
-    first.draw(place, VIEW)
-    np.testing.assert_array_equal(second.draw(place, VIEW, lines), expected[1])
-    first.close()
-    third = kind([FIXED], 1, SIZE)
-    assert not colored(third.draw(place, VIEW), RED).any()
-    np.testing.assert_array_equal(second.draw(place, VIEW), expected[0])
-    third.close()
-    second.close()
-
-
-def test_windows_are_used_again(opengl):
-    """A closed renderer's window, closed once or twice, goes to the next renderer and to no other."""
-    renderer = GLRenderer([BALL], 1, SIZE)
-    window = renderer._viewer
-    renderer.close()
-    renderer.close()
-    with GLRenderer([FIXED], 1, SIZE) as first, GLRenderer([BALL], 1, SIZE) as second:
-        assert window is first._viewer is not second._viewer
-
-
-def test_loaded_bodies_replace_those_before(kind):
-    with kind([BALL], 1, SIZE) as renderer:
-        renderer.draw(poses((0.0, 0.0, 0.0)), VIEW)
-        renderer.load([FIXED], 2)
-        image = renderer.draw(poses(*np.zeros((2, 3))), VIEW)
-    assert colored(image, BLUE).any() and not colored(image, RED).any()
-
-
 def test_body_follows_its_pose_and_a_fixed_shape_stays(one_ball):
     images = [one_ball.draw(poses((0.0, y, 0.5)), VIEW) for y in (0.5, -0.5)]
     left, right = (np.nonzero(colored(image, RED))[1].mean() for image in images)
     assert left < 0.5 * SIZE[0] - 15.0 and right > 0.5 * SIZE[0] + 15.0  # [px]
     blue = [np.argwhere(colored(image, BLUE)).mean(axis=0) + 0.5 for image in images]
     assert np.array(blue) == pytest.approx(np.tile([32.0, 48.0], (2, 1)), abs=1.0)
-
-
-def test_field_of_view_and_eye_may_change_between_images(one_ball):
-    far = View(np.array([-4.0, 0.0, 0.0]), np.zeros(3), 20.0)
-    heights = [
-        np.ptp(np.nonzero(colored(one_ball.draw(poses((9.0, 0.0, 0.0)), view), BLUE))[0]) for view in (VIEW, far)
-    ]
-    focal = 0.5 * SIZE[1] / math.tan(math.radians(10.0))
-    assert heights == pytest.approx([2.0 * FOCAL * RADIUS / 2.0 - 1.0, 2.0 * focal * RADIUS / 4.0 - 1.0], abs=1.5)
 
 
 def test_rotation_of_a_body_turns_its_shapes(kind):
@@ -138,15 +90,6 @@ def test_rotation_of_a_body_turns_its_shapes(kind):
         extents = [np.ptp(np.argwhere(colored(renderer.draw(np.array(pose), VIEW), RED)), axis=0) for pose in
                    (poses((0.0, 0.0, 0.0)), upright)]  # fmt: skip
     assert extents[0][1] > 3 * extents[0][0] and extents[1][0] > 3 * extents[1][1]
-
-
-def test_copies_are_drawn_at_their_poses_and_fixed_shapes_once(kind):
-    with kind([BALL, FIXED], 1, SIZE, (1.0, 1.0)) as renderer:
-        assert renderer.model.shape_count == 3
-        columns = np.nonzero(colored(renderer.draw(poses((0.0, 0.6, 0.0), (0.0, -0.6, 0.0)), VIEW), RED))[1]
-    assert (columns < 40).sum() == pytest.approx((columns > 56).sum(), abs=12) and not (
-        (columns > 40) & (columns < 56)
-    ).any()
 
 
 def test_opacity_mixes_a_copy_with_the_background(opengl):
@@ -178,63 +121,6 @@ def test_arrow_has_its_head_at_the_last_point(opengl):
     assert end.max() >= 2 * start.max()
 
 
-def test_polyline_of_the_ray_tracer_changes_nothing():
-    line = Line(np.array([[0.0, 0.6, 0.4], [0.0, -0.6, 0.4]]), (0.0, 0.0, 1.0))
-    with RayTracer([BALL], 1, SIZE) as renderer:
-        images = [renderer.draw(poses((0.0, 0.0, 0.0)), VIEW, lines) for lines in ([], [line])]
-    np.testing.assert_array_equal(*images)
-
-
-def test_renderers_that_are_open_together_draw_their_own_scene(kind):
-    with kind([BALL], 1, SIZE) as first, kind([FIXED], 1, (64, 64)) as second:
-        images = [renderer.draw(poses((0.0, 0.0, 0.0)), VIEW) for renderer in (first, second, first)]
-    assert [image.shape for image in images] == [(64, 96, 3), (64, 64, 3), (64, 96, 3)]
-    assert [bool(colored(image, RED).any()) for image in images] == [True, False, True]
-    assert [bool(colored(image, BLUE).any()) for image in images] == [False, True, False]
-
-
 def test_points_behind_the_eye_have_no_pixel():
     pixels = VIEW.project(np.array([[-2.5, 0.0, 0.0], [0.0, 0.0, 0.0]]), SIZE)
     assert np.isnan(pixels[0]).all() and pixels[1] == pytest.approx([48.0, 32.0])
-
-
-@pytest.mark.parametrize("eye", [(0.0, 0.0, 2.0), (1.0, 2.0, 3.0)])
-def test_vertical_view_is_refused_in_one_line(one_ball, eye):
-    with pytest.raises(InputError, match=r"^the view from \(\S+, \S+, \S+\) to .* is vertical$") as error:
-        one_ball.draw(poses((0.0, 0.0, 0.0)), View(np.array(eye), np.array([*eye[:2], 0.0])))
-    assert "float" not in str(error.value)
-
-
-def test_ray_tracing_replaces_missing_opengl_and_names_the_packages_to_install(capsys, monkeypatch):
-    monkeypatch.setattr(GLRenderer, "_idle", {})
-
-    def fail(size):
-        raise RuntimeError("NoSuchDisplayException:\n  no display,\n  no device")
-
-    monkeypatch.setattr(module, "_gl_viewer", fail)
-    with open_renderer([BALL], 1, SIZE) as renderer:
-        assert isinstance(renderer, RayTracer)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "NoSuchDisplayException" in line and 'pip install "jumper-warp[video]"' in line and "apt-get install" in line
-
-
-def test_ray_tracing_replaces_missing_pyglet(capsys, monkeypatch):
-    monkeypatch.setattr(GLRenderer, "_idle", {})
-    monkeypatch.setitem(sys.modules, "pyglet", None)
-    assert isinstance(open_renderer([BALL], 1, SIZE), RayTracer)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "pyglet" in line and 'pip install "jumper-warp[video]"' in line
-
-
-def test_any_failure_of_the_viewer_counts_as_missing_opengl(monkeypatch):
-    class Failure(Exception):
-        pass
-
-    def fail(**_):
-        raise Failure("old driver")
-
-    pytest.importorskip("pyglet")
-    monkeypatch.setattr(GLRenderer, "_idle", {})
-    monkeypatch.setattr(module.newton.viewer, "ViewerGL", fail)
-    with pytest.raises(RuntimeError, match="Failure: old driver"):
-        GLRenderer([BALL], 1, SIZE)

@@ -53,12 +53,6 @@ def test_primitive_has_its_extent_and_volume_on_body_0(add, expected_extent, exp
     assert mesh.body == 0
 
 
-def test_normals_of_a_box_are_unit_and_point_outward():
-    (mesh,) = build(lambda b, i: b.add_shape_box(i, hx=0.1, hy=0.2, hz=0.3))
-    assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1.0)
-    assert (np.sum(mesh.normals * mesh.vertices, axis=1) > 0.09).all()  # [m]; the nearest faces are 0.1 m away
-
-
 def test_mesh_shape_has_its_scale_pose_and_color():
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -93,16 +87,3 @@ def test_heightfield_has_its_heights_at_its_nodes_facing_up():
     assert {tuple(np.round(vertex, 5).tolist()) for vertex in mesh.vertices} == expected
     assert len(mesh.triangles) == 4  # two for each of two cells
     assert (mesh.normals[:, 2] > 0.0).all()
-
-
-def test_hidden_shapes_and_other_worlds_are_left_out():
-    def add(builder, body):  # a visible and a hidden box
-        builder.add_shape_box(body, label="seen")
-        builder.add_shape_box(body, label="hidden", cfg=newton.ModelBuilder.ShapeConfig(is_visible=False))
-
-    assert [mesh.name for mesh in build(add)] == ["seen"]
-
-
-def test_shape_meshes_refuses_a_cone_by_name():
-    with pytest.raises(ValueError, match="'hat' is a CONE"):
-        build(lambda b, i: b.add_shape_cone(i, label="hat"))

@@ -17,7 +17,6 @@ from mdp_helpers import STEP_DT, array, new_worlds, standing_robots, write
 from solver_helpers import BODIES, Reference, paw_joint, random_states
 
 N = 64
-WEIGHT = 142.0  # [N]
 
 
 def skill_settings(force, self_collision_margin=0.0, obstacle_margin=0.0):

@@ -7,14 +7,12 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-import pytest
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.runner import CHECKPOINTS, train
-from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, join, push_cfg
 
 FUSED = PpoCfg(
@@ -103,56 +101,6 @@ def iterations(cfgs):
         state = ppo.state_dict()
         results.append((isinstance(ppo, FusedPpo), state, batch, statistics))
     return results
-
-
-def failed_compilation():
-    """Return the message of kernels that do not compile."""
-    ppo = make_ppo(NoiseTask(4), FUSED)
-    ppo.fused.warm_up = lambda: torch.zeros(2).view(3)
-    with pytest.raises(InputError) as error:
-        ppo.compile()
-    return str(error.value)
-
-
-class RecordedKernel:
-    """Kernel that records how it is compiled and launched."""
-
-    def __init__(self):
-        self.compiled, self.launched = [], 0
-
-    def warmup(self, *args, grid, num_warps, num_stages):
-        if args[-1] == 5:
-            raise RuntimeError("does not compile")
-        self.compiled.append((args, grid, num_warps, num_stages))
-
-    def __getitem__(self, grid):
-        def run(*args, num_warps, num_stages):
-            self.launched += 1
-
-        return run
-
-
-def compiled_variants():
-    """Return the compilations of a kernel launched with several arguments, and its launches meanwhile and afterwards.
-
-    The last item is the message of a kernel that does not compile.
-    """
-    from jumper_warp.rl.fused.networks import compile_side_by_side, launch
-
-    kernel, arguments = RecordedKernel(), [(torch.zeros(1), 3), (torch.ones(2), 3), (torch.zeros(1), 4), (None, 3)]
-    device = torch.device("cpu")
-
-    def launches(arguments=arguments):
-        for args in arguments:
-            launch(kernel, (7,), num_warps=8)(*args)
-
-    compile_side_by_side(launches, device)
-    meanwhile = kernel.launched
-    with pytest.raises(RuntimeError) as error:
-        compile_side_by_side(lambda: launches([(None, 5)]), device)
-    launches()
-    compiled = sorted((args[0] is not None, *args[1:], *options) for args, *options in kernel.compiled)
-    return compiled, meanwhile, kernel.launched, str(error.value)
 
 
 def whole_and_resumed(folder: Path):

@@ -1,0 +1,318 @@
+"""Make the tables in docs/ and the policies' pages from the policies' metrics.json; nothing is simulated.
+
+    python experiments/policy_tables.py
+
+A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`,
+`choice` or `seeds`. `policy_pages.toml` defines columns and tests.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import scipy.stats
+
+from jumper_warp.evaluation.attitude import TURN_METRICS
+from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS, PLACE_METRICS
+from jumper_warp.evaluation.velocities import VELOCITY_METRICS
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.assets import POLICIES, policy_tasks
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.metrics import MetricValue, Z, unit_of
+from support.policy_results import CONDITIONS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
+from support.scripts import run_script
+
+BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. ]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+TABLES: dict[str, dict[str, Any]] = PAGES["tables"]  # Tables of tests by name
+SHOWN = {"nominal": "nominal", "randomised": "randomised", "mujoco": "SolverMuJoCo", "friction_0.4": "friction 0.4"}
+"""Conditions in a policy's main table, and their titles there."""
+SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
+              "velocity": "paper, robot, commands by a person"}  # fmt: skip
+"""Words for `Evaluation.paper` by `Evaluation.kind`."""
+ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
+KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
+LEAST = 20  # Least number of trials of a metric that is compared between seeds
+LEVEL = 0.01  # [1] Level of significance after correction
+POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
+RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else success_rate
+ERRORS = {
+    "height": ("in_range_apex_error_abs_mean_m", 1000.0, "{:.1f} mm"),
+    "place": ("goal_distance_at_rest_mean_m", 1000.0, "{:.1f} mm"),
+    "velocity": ("settled_rmse_vx_m_s", 1.0, "{:.3f} m/s"),
+    "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
+}
+"""Key of the error, factor and format by kind."""
+Results = Mapping[str, MetricValue]  # Metrics by key
+
+
+def published(task: TaskCfg) -> list[tuple[str, Results]]:
+    """Return the published results of a task, each as a description and its metrics by key."""
+    evaluation = task.evaluation
+    kind = evaluation.kind if evaluation == type(evaluation)() else ""  # else other tests than the published ones
+    known = [(SIMULATION[kind], evaluation.paper)] if kind in SIMULATION else []
+    return [(words, {key: MetricValue(value) for key, value in values.items()})
+            for words, values in (*known, *PAGES["robot"].get(kind, ()))]  # fmt: skip
+
+
+def kind_of(task: TaskCfg) -> str:
+    """Return the kind of a task that selects the columns of its table: height, place, velocity or attitude."""
+    return task.evaluation.kind
+
+
+def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
+    """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
+    if pair := values.get("trained_range_m"):
+        levels: Any = task.levels
+        aside, back = max(level.goal_upper[1] for level in levels), -min(level.goal_lower[0] for level in levels)
+        if kind_of(task) == "height":
+            return "{:g} to {:g} m".format(*pair)
+        if back > 0.0:
+            return f"up to {pair[1]:g} m ahead, {aside:g} m aside, {back:g} m back"
+        return f"{pair[0]:g} to {pair[1]:g} m ahead, {aside:g} m aside"
+    if limits := values.get("trained_velocities"):
+        return "{:g} / -{:g} m/s, ±{:g} m/s, ±{:g} rad/s".format(*limits)
+    angles = [angle for level in task.levels for angle in level.angle]
+    return f"{min(angles):g} to {max(angles):g}°"
+
+
+def number(key: str, value: Any) -> str:
+    """Format a metric's value: rates in per cent, others with one, two or four decimals, which depend on the key."""
+    if value is None:
+        return "–"
+    if key.endswith("_rate"):
+        return f"{100.0 * value:.1f} %"
+    if key.startswith("reliable_") or unit_of(key) == "N":
+        return f"{value:.1f}"
+    return f"{value:.2f}" if key.endswith(("_s", "_deg")) and "rmse" not in key else f"{value:.4f}"
+
+
+def cell(column: Sequence[str], metrics: Results) -> str:
+    """Format a cell of a table, empty if the metrics lack all keys; column: title and keys, ± adds the interval."""
+    text, interval = [], None
+    for key in column[1:]:
+        if metric := metrics.get(key.removeprefix("±")):
+            text.append(number(key, metric.value))
+            interval = metric.interval if key.startswith("±") else interval
+    limits = "" if interval is None else " ({} to {})".format(*(f"{100.0 * limit:.1f}" for limit in interval))
+    return " / ".join(text) + limits
+
+
+def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table with column titles and lines of cells."""
+    table = [titles, ["---"] * len(titles), *lines]
+    return "\n".join(f"| {' | '.join(line)} |" for line in table) + "\n"
+
+
+def trials_of(row: Row) -> str:
+    """Format the largest number of trials of a row's metrics."""
+    return f"{max(value.trials or 0 for value in row.metrics.values()):,}"
+
+
+def first_seed(policy: str) -> dict[str, Row]:
+    """Return the saved rows of a policy with the smallest seed, by condition."""
+    return {row.condition: row for row in reversed(saved_rows(policy))}
+
+
+def main_table(policy: str, task: TaskCfg) -> str:
+    """Return the main table of a policy: metrics as rows, conditions and published results as columns."""
+    rows, paper = first_seed(policy), published(task)
+    single = [(title, rows[name].metrics) for name, title in SHOWN.items() if name in rows]
+    single += [(words, metrics) for words, metrics in paper if not words.startswith(ON_ROBOT)]
+    robot = {words.removeprefix(ON_ROBOT): metrics for words, metrics in paper if words.startswith(ON_ROBOT)}
+    titles, together = [title for title, _ in single], ON_ROBOT.strip(", ")
+    lines = []
+    for line in PAGES["main"][kind_of(task)]:
+        cells = [line[0], *(cell(line, metrics) for _, metrics in single)]
+        on_robot = " / ".join(filter(None, (cell(line, metrics) for metrics in robot.values())))
+        lines.append([*cells, on_robot] if robot else cells)
+    nominal = rows["nominal"]
+    note = f"{trials_of(nominal)} trials a column; commands: {nominal.values['commands']}"
+    if kind_of(task) == "height":
+        note += "; in range: " + str(nominal.metrics["in_range_success_rate"].over).partition("goals of ")[2]
+    note += f".\n{together.capitalize()}: {' / '.join(robot)}" if robot else ""
+    return markdown(["", *titles, *([together] if robot else [])], lines) + f"\n{note}.\n"
+
+
+def all_conditions(policy: str, task: TaskCfg) -> str:
+    """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
+    rows, wide = first_seed(policy), PAGES["wide"][kind_of(task)]
+    results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
+    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
+    nominal = rows["nominal"]
+    note = f"{trials_of(nominal)} trials a row; commands: {nominal.values['commands']}.\n"
+    note += f"Trained on {trained_on(task, nominal.values)}.\n"
+    reasons = [f"Not measured: {title}, since {reason}.\n"
+               for name, (title, _) in CONDITIONS.items() if (reason := undefined(task, name))]  # fmt: skip
+    return "\n".join([markdown(["condition", *(column[0] for column in wide)], lines), note, *reasons])
+
+
+def test_table(name: str) -> str:
+    """Return the Markdown table `name` of TABLES, a line per policy and test; unmeasured tests are left out."""
+    tests, wide = TABLES[name]["tests"], TABLES[name]["columns"]
+    policies = TABLES[name].get("policies") or TESTS[tests[0]]["policies"]
+    lines = []
+    for policy in policies:
+        rows = first_seed(policy)
+        for test in (test for test in tests if test in rows):
+            words = TESTS[test]["words"] if test in TESTS else f"{rows[test].values['commands']}, {CONDITIONS[test][0]}"
+            cells = (trials_of(rows[test]) if x == ["trials"] else cell(x, rows[test].metrics) for x in wide)
+            lines.append([policy, words, *cells])
+    first = 1 if len(policies) == 1 else 0
+    return markdown(["policy", "test", *(x[0] for x in wide)][first:], [line[first:] for line in lines])
+
+
+def key_table(name: str) -> str:
+    """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
+    lines = [[f"`{metric.key}`", "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
+              metric.statistic.__name__, metric.over] for metric in KEYS[name]]  # fmt: skip
+    return markdown(("key", "unit", "statistic", "over"), lines)
+
+
+def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
+    """Return a Markdown table with a policy for each need: tested and trained commands, success, error, limits."""
+    lines = []
+    for need in PAGES["needs"]:
+        policy, tests = need["policy"], need.get("tests", ("nominal", "randomised", "friction_0.4"))
+        rows, task = first_seed(policy), tasks[policy]
+        page, values = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)], rows[tests[0]].values
+        speed = values.get("speed_m_s")
+        tested = str(values["commands"]) if speed is None else f"bumps, slopes, steps at {speed} m/s"
+        cells = [_success(rows[test], kind_of(task)) if test in rows else "" for test in tests]
+        trained = trained_on(task, rows["nominal"].values)
+        lines.append([need["need"], f"[{policy}]({page}.md)", tested, *cells, trained, need["unless"]])
+    titles = ("need", "policy", "tested on", "nominal", "randomised", "friction 0.4", "trained on", "not for")
+    return markdown(titles, lines)
+
+
+def _success(row: Row, kind: str) -> str:
+    """Format success, for walking the falls, and mean error of a row; of a test of terrains the falls on the worst."""
+    if "speed_m_s" in row.values:
+        rates = [metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate")]
+        parts = [f"{number('fall_rate', max(rate for rate in rates if isinstance(rate, float)))} fall"]
+    else:
+        rate, (key, factor, text) = RATES.get(kind, "success_rate"), ERRORS[kind]
+        share, error = number(rate, row.metrics[rate].value).replace("100.0", "100"), row.metrics[key].value
+        assert isinstance(error, float)
+        parts = [share + " fall" * (kind == "velocity"), text.format(factor * error)]
+    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
+
+
+class SeedTest(NamedTuple):
+    """Significance test of the difference of one metric between two seeds."""
+
+    policy: str
+    condition: str
+    key: str
+    values: tuple[Any, Any]
+    p: float  # Two-sided
+
+
+def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
+    """Return the two-sided p-value of the hypothesis that two rates or two means are equal.
+
+    Rates are compared by the two-proportion test with pooled variance, means by Welch's t-test, whose standard errors
+    follow from the 95 % intervals.
+    """
+    (p, n), (q, m) = ((float(x.value), int(x.trials or 0)) for x in (a, b))  # pyright: ignore[reportArgumentType]
+    if key.endswith("_rate"):
+        pooled = (p * n + q * m) / (n + m)
+        v, w, survival = pooled * (1.0 - pooled) / n, pooled * (1.0 - pooled) / m, scipy.stats.norm.sf
+    else:
+        v, w = (((x.interval[1] - x.interval[0]) / (2.0 * Z)) ** 2 if x.interval else 0.0 for x in (a, b))
+        freedom = (v + w) ** 2 / max(v**2 / (n - 1) + w**2 / (m - 1), 1.0e-300)
+        survival = partial(scipy.stats.t.sf, df=freedom)
+    if v + w == 0.0:
+        return 1.0 if p == q else 0.0
+    return 2.0 * float(survival(abs(p - q) / math.sqrt(v + w)))
+
+
+def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
+    """Test every metric for a difference between the first two seeds of each policy and condition.
+
+    Metrics without an interval or with fewer than LEAST trials are left out.
+    """
+    pairs: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        pairs.setdefault(row[:2], []).append(row)
+    tests = []
+    for (policy, condition), (first, *others) in pairs.items():
+        for key, a in first.metrics.items() if others else ():
+            b = others[0].metrics.get(key, MetricValue(None))
+            if a.interval and b.interval and min(a.trials or 0, b.trials or 0) >= LEAST:
+                tests.append(SeedTest(policy, condition, key, (a.value, b.value), difference_p(key, a, b)))
+    return tests
+
+
+def seed_section(rows: Sequence[Row]) -> str:
+    """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
+    tests = sorted(seed_tests(rows), key=lambda test: test.p)
+    count, compared = len(tests), len({test[:2] for test in tests})
+    significant = [test for test in tests if test.p * count < LEVEL]
+    text = (
+        f"{compared} rows were measured with two seeds. Each of their {count:,} rates and means was compared:\n"
+        "rates by two-proportion tests, means by Welch's t-tests.\n"
+        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}). "
+        + ("These are:\n" if significant else "The smallest p-values are:\n")
+    )
+    lines = [
+        [test.policy, CONDITIONS[test.condition][0], f"`{test.key}`",
+         *(number(test.key, value) for value in test.values), f"{test.p:.2g}", f"{min(test.p * count, 1.0):.2g}"]
+        for test in significant or tests[:3]
+    ]  # fmt: skip
+    titles = ("policy", "condition", "metric", "first seed", "second seed", "p", "corrected p")
+    return text + "\n" + markdown(titles, lines)
+
+
+def pages() -> list[Path]:
+    """Return the paths of the documentation pages and policies' READMEs that may have generated tables."""
+    return [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "reference/metrics.md",
+            *sorted(POLICIES.glob("*/README.md"))]  # fmt: skip
+
+
+def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
+    """Return the table `name` as Markdown. Raises InputError: there is no such table."""
+    kind, _, subject = name.partition(" ")
+    if kind in ("main", "all") and subject in tasks:
+        return (main_table if kind == "main" else all_conditions)(subject, tasks[subject])
+    if kind == "test" and subject in TABLES:
+        return test_table(subject)
+    if kind == "keys" and subject in KEYS:
+        return key_table(subject)
+    if name == "choice":
+        return choice_table(tasks)
+    if name == "seeds":
+        return seed_section([row for policy in tasks for row in saved_rows(policy)])
+    raise InputError(f"no table {name!r:.40}")
+
+
+def filled(text: str, tasks: Mapping[str, TaskCfg]) -> str:
+    """Return the text of a page with its tables made from the policies' metrics.json; tasks: of all policies."""
+    return BLOCK.sub(lambda block: f"{block[1]}\n{make_table(block['name'], tasks)}\n{block[3]}", text)
+
+
+@dataclass(frozen=True)
+class Args:
+    """The script has no flags."""
+
+
+def main(_: Args) -> int:
+    """Make the tables of all pages, print the paths of the pages that changed, and return their number."""
+    tasks, changed = tasks_of(policy_tasks()), []
+    for path in pages():
+        old = path.read_text(encoding="utf-8")
+        if (new := filled(old, tasks)) != old:
+            write_atomically(path, new.encode())
+            changed.append(path)
+    print("\n".join(map(str, changed)) or "no table changed")
+    return len(changed)
+
+
+if __name__ == "__main__":
+    run_script(main, Args)
