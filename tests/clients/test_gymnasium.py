@@ -1,5 +1,7 @@
 """Gymnasium: autoreset modes, vector wrappers, one-world environments, statistics of episodes."""
 
+import copy
+import pickle
 import re
 import warnings
 from functools import partial
@@ -348,6 +350,14 @@ def test_record_video_films_one_world(tmp_path):
         env.step(action)
     env.close()
     assert any((tmp_path / "films").glob("*.mp4"))
+
+
+@pytest.mark.parametrize("copied", [pickle.dumps, copy.deepcopy])
+def test_pickle_and_deep_copy_are_refused_with_the_reason(copied):
+    for envs in (vector(), GymEnv(Env(TASK, 1, device="cpu"))):
+        envs.reset()
+        with pytest.raises(TypeError, match=r"Env can be neither copied nor pickled: .*make another one"):
+            copied(envs)
 
 
 def test_several_worlds_are_refused_by_make():

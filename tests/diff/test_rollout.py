@@ -1,5 +1,6 @@
 """Rollouts: forward pass against the simulation, threads, the PyTorch bridge, and refusals of bad input."""
 
+import copy
 import math
 
 import numpy as np
@@ -174,6 +175,12 @@ def test_gradient_by_q_includes_default_initial_target():
         for gradient in results:
             assert gradient[entry].item() == pytest.approx(expected, rel=1.0e-4)
         assert by_q_alone[entry].item() != pytest.approx(expected, rel=1.0e-2)
+
+
+def test_rollouts_and_simulations_can_be_neither_copied_nor_pickled():
+    for made in (rollout(), Simulation(1, device="cpu")):
+        with pytest.raises(TypeError, match=f"{type(made).__name__} can be neither copied nor pickled"):
+            copy.deepcopy(made)
 
 
 def test_second_derivatives_are_refused():
