@@ -21,6 +21,15 @@ from jumper_warp.utils.files import parse_json, read_file, read_json
 COMMAND_BOUND = 4.0 * math.pi  # [rad] Motor targets are clipped to ± this before the filter
 JOINTS = tuple(f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner"))
 """Names of the motors, in the order of all arrays."""
+PLAUSIBLE = {
+    "angle": (math.pi, "rad"), "rate": (100.0, "rad/s"), "lin_vel": (20.0, "m/s"), "ang_vel": (100.0, "rad/s"),
+    "height": (10.0, "m"), "wanted_height": (10.0, "m"), "goal": (100.0, "m"), "jump_command": (1.0, ""),
+}  # fmt: skip
+"""Largest absolute value and unit of readings by name; beyond, they are in another unit or of a faulty sensor."""
+LARGEST = 1.0e6  # Largest absolute value of other readings
+UNIT_LENGTH = (0.9, 1.1)  # Least and largest length of `gravity`, a unit vector
+EXTERNAL = b"\x0a\x08location"
+"""Bytes that name another file in ONNX's `TensorProto.external_data`: the key `location`, field 1 of an entry."""
 LAST_ACTION = "last_action"  # Observation term that `DeployedPolicy` computes, so that readings must not contain it
 
 
@@ -30,9 +39,10 @@ class DeployedPolicy:
     It is a policy step: `observe`, `act` and `filter_targets`. Arrays with one value per motor, (12,), have the legs
     FL, FR, BL, BR in this order; each lateral, outer, inner.
 
-    `targets` and `observe` raise InputError for a reading that is missing, of another size or not finite, and change
-    nothing: hold the last target, and call `targets` again with the next readings. The history then has a gap of one
-    policy step. If faults last longer than 0.1 s, switch the motors to damping and call `reset` before a restart.
+    `targets` and `observe` raise InputError for a reading that is missing, of another size, not finite or implausible,
+    such as degrees for radians, and change nothing: hold the last target, and call `targets` again with the next
+    readings. The history then has a gap of one policy step. If faults last longer than 0.1 s, switch the motors to
+    damping and call `reset` before a restart.
     """
 
     def __init__(self, file: str | Path) -> None:
@@ -76,7 +86,7 @@ class DeployedPolicy:
 
         readings: sensor values of each observation term but last_action, by name; `angle`: (12,) [rad], the default
         pose not subtracted; `rate`: (12,) [rad/s]. Raises InputError, and changes nothing: one is missing, unknown, of
-        another size, or not finite.
+        another size, not finite, or beyond `PLAUSIBLE`.
         """
         action = self.act(self.observe(readings))
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
@@ -94,7 +104,10 @@ class DeployedPolicy:
         return np.concatenate([self._term(name, term, values[name]) for name, term in self.layout.items()])
 
     def _reading(self, name: str, reading: Any) -> np.ndarray:
-        """Return a sensor reading as (width,) float32. Raises InputError: it is of another size, or not finite."""
+        """Return a sensor reading as (width,) float32.
+
+        Raises InputError: it is of another size, not finite, or implausible.
+        """
         try:
             with np.errstate(over="ignore"):
                 value = np.atleast_1d(np.asarray(reading, dtype=np.float32))
@@ -105,6 +118,13 @@ class DeployedPolicy:
             raise InputError(f"{name} must have {width} values, got shape {value.shape}")
         if not np.isfinite(value).all():
             raise InputError(f"{name} is not finite: {value!s:.100}; hold the last target")
+        bound, unit = PLAUSIBLE.get(name, (LARGEST, ""))
+        largest = value[np.argmax(np.abs(value))]
+        if abs(largest) > bound:
+            limit = f"±{bound:.4g} {unit}".strip()
+            raise InputError(f"{name} must be within {limit}, got {largest:.4g}; hold the last target")
+        if name == "gravity" and not UNIT_LENGTH[0] <= (length := float(np.linalg.norm(value))) <= UNIT_LENGTH[1]:
+            raise InputError(f"gravity must be a unit vector, got length {length:.4g}; hold the last target")
         return value
 
     def _term(self, name: str, term: Mapping[str, Any], value: np.ndarray) -> np.ndarray:
@@ -147,10 +167,12 @@ class DeployedPolicy:
 def _verified(file: Path) -> bytes:
     """Return the content of a policy's ONNX file, after comparing it with its checksum.
 
-    Raises InputError: it cannot be read, or differs from its checksum: in its metadata, or in the manifest of its
-    policy folder.
+    Raises InputError: it cannot be read, takes weights from another file, or differs from its checksum: in its
+    metadata, or in the manifest of its policy folder.
     """
     data = read_file(file, "ONNX file of a policy")
+    if EXTERNAL in data:
+        raise InputError(f"{file}: takes weights from another file, which its checksum does not cover")
     size = len(checksum_entry(b""))
     if data[-size:] == checksum_entry(data[:-size]):
         return data
@@ -231,10 +253,14 @@ class JumpCommand:
         """Detect takeoff and landing, clear the command at landing, and return `jump_command`, 0 or 1.
 
         Call it once per policy step. vertical_velocity: of the base, world frame, upward positive [m/s]; paws_down:
-        number of paws on the ground. Raises InputError, and changes nothing: one is not finite.
+        number of paws on the ground. Raises InputError, and changes nothing: one is not finite or implausible.
         """
         if not (math.isfinite(vertical_velocity) and math.isfinite(paws_down)):
             raise InputError(f"vertical_velocity and paws_down must be finite, got {vertical_velocity}, {paws_down}")
+        fastest = PLAUSIBLE["lin_vel"][0]
+        if abs(vertical_velocity) > fastest or not 0 <= paws_down <= 4:
+            given = f"{vertical_velocity:.4g}, {paws_down}"
+            raise InputError(f"vertical_velocity must be within ±{fastest:g} m/s and paws_down 0 to 4, got {given}")
         rises = vertical_velocity > self._takeoff_speed
         if self.in_flight and paws_down > 0 and not rises:
             self.requested, self.in_flight = False, False

@@ -32,6 +32,7 @@ from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.sim.slices import WorldRange, slices_of
 from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
+from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.threads import checked_threads, locked, run_in_parallel
@@ -76,7 +77,7 @@ class Trajectory:
         return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 
 
-class Rollout:
+class Rollout(Uncopied):
     """Differentiable simulation of many worlds over policy steps: forward and reverse pass.
 
     In single or double precision. Gradients are exact at the contact modes and branches of filter and motors of the

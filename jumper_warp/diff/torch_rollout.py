@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
@@ -52,11 +51,11 @@ def simulate(
 ) -> TorchTrajectory:
     """Simulate all worlds over policy steps as a PyTorch function, and return their trajectory.
 
-    It can be differentiated once w.r.t. all tensors except `impulse`. Arguments and shapes are those of `Rollout.run`,
-    with or without the axis of worlds. parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the
-    legs' lengths of all worlds; they are written to the rollout and stay there, and have gradients only from the calls
-    that they are passed to. trusted: do not check the values; otherwise on a GPU only the latency is checked, which
-    waits for the device.
+    It can be differentiated once w.r.t. all tensors except `impulse`: the reverse pass raises InputError if
+    `create_graph` is set. Arguments and shapes are those of `Rollout.run`, with or without the axis of worlds.
+    parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds; they are
+    written to the rollout and stay there, and have gradients only from the calls that they are passed to. trusted: do
+    not check the values; otherwise on a GPU only the latency is checked, which waits for the device.
 
     A policy in the loop runs one policy step per call, each from `end()` of the previous one. Raises InputError:
     unknown parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass
@@ -134,12 +133,13 @@ class _Simulate(torch.autograd.Function):
         return tuple(outputs)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
         """Return the gradients w.r.t. the inputs of a rollout, by its reverse pass.
 
         It uses the parameters of the forward pass; grads: w.r.t. `OUTPUTS`, None for zero.
         """
+        if torch.is_grad_enabled():  # as `create_graph` sets it; gradients of a linear loss would have no graph
+            raise InputError("simulate has no second derivatives: create_graph must be False")
         rollout, trajectory = ctx.rollout, ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}

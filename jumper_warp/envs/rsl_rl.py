@@ -77,7 +77,7 @@ class RslRlVecEnv(RslRlEnv):
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:
-        """Return the observations as groups `policy` and `critic`, finite and bounded."""
+        """Return the observations as groups `actor` and `critic`, finite and bounded."""
         groups = {"actor": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 

@@ -31,6 +31,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
+from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.kernels import Kernel
 from jumper_warp.utils.streams import Purpose
 
@@ -60,7 +61,7 @@ class WorldSlice(NamedTuple):
     episode: Any  # The kernels' `EpisodeArrays` that begin at `first`
 
 
-class Stages:
+class Stages(Uncopied):
     """Arrays and kernel launches of an environment; `Env` adds the public methods."""
 
     sim: Simulation

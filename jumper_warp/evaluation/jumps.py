@@ -179,7 +179,7 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Create a log of jumps that have not begun.
 
-        goals [m]: apex heights of the base above the ground, (num_envs,), or landing positions ahead and to the left,
+        goals [m]: apex heights of the base, world z, (num_envs,), or landing positions ahead and to the left,
         (num_envs, jumps in a row, 2 or 3), third the apex height, 0 for any; terminations: names of the task's
         terminations, SUCCESS among them; headings [rad]: (num_envs,) or one for all; delay [s]: time until the first
         jump is commanded, likewise; rest [s]: time from touchdown to the end of the jump and the next command. Raises

@@ -242,7 +242,7 @@ def summarise(
     """Collect the results of an identification from its minima: estimate, uncertainty and fit.
 
     minima: of all starts, best first. steps: log of the optimisation. effort: called after all evaluations. Raises
-    InputError: no parameter is identified, as with a robot that does not move.
+    InputError: the fit is consistent and identifies no parameter, as with a robot that does not move.
     """
     point, normal = minima[0]
     nominal, errors = (channel_errors(problem, at) for at in (problem.nominal_point(), point))
@@ -284,9 +284,10 @@ def summarise(
         motions=tuple(problem.motions),
         initial_states=tuple(point.starts),
     )
-    if not result.identified.any():
-        reasons = "; ".join(direction.words for direction in result.directions[:2])
-        raise InputError(f"the motions identify none of {len(result.parameters)} parameters: {reasons}")
     far = np.max(np.abs(distance / result.std), axis=1, where=result.identified, initial=0.0)
     starts = tuple(Start(float(e), float(d)) for e, d in zip(excess, far, strict=True))
-    return replace(result, starts=starts)
+    result = replace(result, starts=starts)
+    if result.consistent and not result.identified.any():
+        reasons = "; ".join(direction.words for direction in result.directions[:2])
+        raise InputError(f"the motions identify none of {len(result.parameters)} parameters: {reasons}")
+    return result

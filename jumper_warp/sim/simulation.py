@@ -23,6 +23,7 @@ from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
+from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked, stop_spinning
 
@@ -34,7 +35,7 @@ SUBSTEPS = 8  # Physics steps of 1/480 s in a policy step of 1/60 s
 SolverName = Literal["jumper", "mujoco"]
 
 
-class Simulation:
+class Simulation(Uncopied):
     """Batched simulation of the robot under position targets, which starts standing in the default pose.
 
     Pass motor targets [rad] to `set_targets`, or write them unchecked on the device to `target`, (12, num_worlds).

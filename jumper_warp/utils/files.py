@@ -1,6 +1,5 @@
 """Atomic file writes, and bounded reading of regular files and of JSON."""
 
-import fcntl
 import json
 import math
 import os
@@ -52,6 +51,8 @@ def _open_alone(part: Path) -> BinaryIO:
 
     Waits for those, which rename the file that they have opened.
     """
+    import fcntl  # absent on Windows, where files can still be read
+
     while True:
         file = part.open("ab")
         with suppress(OSError):  # a file system without locks

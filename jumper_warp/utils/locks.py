@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -41,6 +40,8 @@ def directory_lock(folder: Path) -> Iterator[None]:
 
     No file is written. There is no lock on network file systems that do not support one. OSError: no such folder.
     """
+    import fcntl  # absent on Windows
+
     directory = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):

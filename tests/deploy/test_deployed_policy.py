@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from onnx.external_data_helper import convert_model_to_external_data
 
 from columns import ANG_VEL, QUAT, XY, X, Y, Z
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
@@ -19,6 +20,7 @@ from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.onnx import export_onnx
 from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.spec import checksum_entry
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.utils.errors import InputError
@@ -47,7 +49,6 @@ MISTAKES = {
     "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.392),
     "no history": (without_history, 0.814),
     "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.872),
-    "gravity times 9.81": (lambda policy, r: r | {"gravity": 9.81 * r["gravity"]}, 0.949),
     "no filter": (without_filter, 0.904),
 }
 """Mistakes of a deployment program by name: a function that makes it, and the documented apex [m]."""
@@ -211,9 +212,10 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step():
 
 
 def zero_readings(policy):
-    """Return readings of zero for all terms of a policy's observation."""
+    """Return readings of zero for all terms of a policy's observation, but gravity along -z."""
     widths = {name: (term["end"] - term["first"]) // term["history"] for name, term in policy.layout.items()}
-    return {name: np.zeros(width) for name, width in widths.items() if name != "last_action"}
+    readings = {name: np.zeros(width) for name, width in widths.items() if name != "last_action"}
+    return readings | ({"gravity": [0.0, 0.0, -1.0]} if "gravity" in readings else {})
 
 
 @pytest.mark.parametrize("value", [math.nan, 1e39])
@@ -228,6 +230,43 @@ def test_refuses_a_reading_that_is_not_finite_and_continues_with_the_next(value)
         with pytest.raises(InputError, match=f"^{name} is not finite: .*; hold the last target$"):
             policy.targets(readings | {name: faulty})
     np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"angle": np.degrees(np.tile([0.0, 0.8, 0.8], 4))}, r"angle must be within ±3.142 rad, got 45.84"),
+        ({"rate": np.full(12, 300.0)}, r"rate must be within ±100 rad/s, got 300"),
+        ({"height": 1e30}, r"height must be within ±10 m, got 1e\+30"),
+        ({"wanted_height": -500.0}, r"wanted_height must be within ±10 m, got -500"),
+        ({"jump_command": 2.0}, r"jump_command must be within ±1, got 2"),
+        ({"gravity": [0.0, 0.0, -9.81]}, "gravity must be a unit vector, got length 9.81"),
+        ({"gravity": np.zeros(3)}, "gravity must be a unit vector, got length 0"),
+    ],
+)
+def test_refuses_an_implausible_reading_and_keeps_the_history(change, message):
+    policy, faultless = onnx_of("vertical_jump"), onnx_of("vertical_jump")
+    readings = zero_readings(policy)
+    with pytest.raises(InputError, match=f"^{message}; hold the last target$"):
+        policy.targets(readings | change)
+    np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
+
+
+def test_refuses_weights_in_another_file_than_the_checksum_covers(tmp_path, monkeypatch):
+    model = onnx.load(find_policy("vertical_jump") / "policy.onnx")
+    convert_model_to_external_data(model, location="weights.bin", size_threshold=1024)
+    onnx.save(model, tmp_path / "policy.onnx")
+    data = (tmp_path / "policy.onnx").read_bytes()
+    (tmp_path / "policy.onnx").write_bytes(data + checksum_entry(data))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"policy\.onnx: takes weights from another file"):
+        DeployedPolicy("policy.onnx")
+
+
+@pytest.mark.parametrize("values", [(1.0e30, 4), (0.0, -1), (0.0, 5)])  # vertical velocity [m/s], paws down
+def test_jump_command_refuses_implausible_values(values):
+    with pytest.raises(InputError, match="vertical_velocity must be within ±20 m/s and paws_down 0 to 4"):
+        JumpCommand().update(*values)
 
 
 def test_exported_file_has_its_checksum_and_the_weights_of_the_policy(tmp_path):

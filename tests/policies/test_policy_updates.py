@@ -5,8 +5,8 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-
 from boundary import small_policy
+
 from jumper_warp.policies.folder import add_files, read_policy, save_policy
 from jumper_warp.utils.files import write_atomically
 
