@@ -92,6 +92,7 @@ def dispatch(args: Sequence[str]) -> None:
     if name not in COMMANDS:
         near = suggestion(name, COMMANDS) or f"; there are {', '.join(COMMANDS)}"
         raise UsageError(f"no command {name!r:.60}{near}")
+    check_not_empty(args)
     rest, files = split_task_modules(args[1:])
     modules = []
     try:
@@ -106,6 +107,14 @@ def dispatch(args: Sequence[str]) -> None:
         if message := user_file_error(folders, error):
             raise InputError(message) from error
         raise
+
+
+def check_not_empty(args: Sequence[str]) -> None:
+    """Raise UsageError if an argument is empty, such as an unset variable of a shell, or the value after `--flag=`."""
+    for before, arg in itertools.pairwise(["jumper", *args]):
+        flag, equals, value = arg.partition("=")
+        if not arg or (flag.startswith("--") and equals and not value):
+            raise UsageError(f"empty value of {flag}" if arg else f"empty value after {before}")
 
 
 def user_file_error(folders: Collection[str], error: Exception) -> str | None:
@@ -146,6 +155,7 @@ def parse(
     from jumper_warp.cli.help import help_page, wants_help
     from jumper_warp.cli.renamed_flags import use_new_names
 
+    check_not_empty(args)
     task_module = Flag(
         "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
     )

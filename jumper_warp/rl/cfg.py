@@ -213,6 +213,8 @@ class TrainCfg:
         checked_threads(self.threads)
         check_seed(self.seed)
         for name in ("resume", "init_policy"):
+            if getattr(self, name) == "":
+                raise InputError(f"{name} is empty: pass None to begin without it")
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:

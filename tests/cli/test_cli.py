@@ -151,6 +151,29 @@ def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkey
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]
 
 
+@pytest.mark.parametrize(
+    ("args", "place"),
+    [
+        (["train", "vertical-jump", "--resume", ""], "after --resume"),
+        (["train", "vertical-jump", "--init-policy="], "of --init-policy"),
+        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "after --log-root"),
+        (["train", ""], "after train"),
+        (["evaluate", "vertical_jump", "--out", ""], "after --out"),
+        (["evaluate", ""], "after evaluate"),
+        (["play", "--script", ""], "after --script"),
+        (["export", "vertical_jump", "--out="], "of --out"),
+        (["sysid", "fit", ""], "after fit"),
+        (["list", "--task-module", ""], "after --task-module"),
+    ],
+    ids=str,
+)
+def test_refuses_empty_values(capsys, tmp_path, monkeypatch, args, place):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *args)
+    assert (code, out, len(err)) == (2, "", 1) and not list(tmp_path.iterdir())
+    assert err == [f"jumper: empty value {place}"]
+
+
 def test_no_arguments_prints_usage_and_exits_with_2(capsys):
     code, out, err = run(capsys)
     assert (code, out) == (2, "") and err[0].startswith("usage: jumper COMMAND")

@@ -304,6 +304,8 @@ def test_each_rank_resumes_its_own_worlds(cfg):
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
         ({"seed": 2**31}, "seed must be in"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
+        ({"resume": ""}, "resume is empty"),
+        ({"init_policy": ""}, "init_policy is empty"),
     ],
 )
 def test_refuses_settings_out_of_range(change, message):
