@@ -21,7 +21,7 @@ from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
 from jumper_warp.rl.cfg import UNUSED, TrainCfg
 from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
-from jumper_warp.utils.threads import checked_threads
+from jumper_warp.utils.threads import checked_threads, torchrun_variable
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -213,7 +213,7 @@ def memory_message(task: TaskCfg, args: TrainArgs, error: Exception) -> str:
     device = torch.device(wp.device_to_torch(wp.get_device(args.cfg.device)))
     if device.type == "cuda":
         device = torch.device("cuda", torch.cuda.current_device())  # of this rank
-    num_envs = args.cfg.num_envs // int(os.environ.get("WORLD_SIZE", "1"))
+    num_envs = args.cfg.num_envs // torchrun_variable("WORLD_SIZE")
     pools = memory_pools(task, args.cfg.ppo, args.solver, device, rebuilt=True)
     parts = [f"out of memory: {describe_need(pools, args.cfg.ppo, num_envs)}", *getattr(error, "__notes__", [])]
     return "; ".join(parts)

@@ -17,7 +17,7 @@ from jumper_warp.rl.distributed import world_size
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.threads import checked_threads
+from jumper_warp.utils.threads import checked_threads, torchrun_variable
 
 NUM_ACTIONS = 12  # motors
 BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
@@ -93,7 +93,7 @@ def memory_pools(
     threads = 1 if device.type == "cuda" else checked_threads(None)
     learning = learning_need(ppo, num_obs, num_critic_obs)
     learning = learning._replace(fixed=learning.fixed + threads * RECORD_BYTES)
-    main_free = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    main_free = free_main_memory() // torchrun_variable("LOCAL_WORLD_SIZE")
     main_free += own_main_memory() if rebuilt else 0
     build_bytes = BUILD_BYTES[solver]
     if device.type != "cuda":

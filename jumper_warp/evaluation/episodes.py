@@ -167,7 +167,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
         raise InputError(f"num_episodes must be at least 1, got {count}")
     if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
-    check(0.0 < seconds <= MAX_SECONDS, f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
+    check(0.1 <= seconds <= MAX_SECONDS, f"seconds must be in [0.1, {MAX_SECONDS:g}], got {seconds}")
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:

@@ -125,7 +125,6 @@ def test_each_command_prints_help(capsys, command):
         ([*TRAIN, "--env.rewards.jump-height.weight", "nan"], "jump-height.weight must be a finite number"),
         ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "--env.terminations.tilted.angle must be a finite number"),
         (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
-        (["list", "--task-module="], "--task-module needs a FILE.py or the name of a module"),
         (["train", "--task-module", "--max-iterations", "3"], "--task-module needs a FILE.py"),
         (["list", "--task-module", "missing.py"], "missing.py: no such file (tasks of your own)"),
         (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
@@ -142,6 +141,19 @@ def test_each_command_prints_help(capsys, command):
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
         (["export", "vertical_jump", "--out", "x.safetensors"], "whose name cannot end in .safetensors"),
         (["finetune", "vertical_jump", "--out", "x.onnx"], "whose name cannot end in .onnx"),
+        (["finetune", "vertical_jump", "--out", "."], "a policy's folder needs a name, got ."),
+        (["export", "vertical_jump", "--out", "..", "--overwrite"], "a policy's folder needs a name, got .."),
+        (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.1, 600], got 0.001"),
+        (["play", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.1, 600], got 0.001"),
+        (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.1, 600], got 0.006"),
+        (
+            ["evaluate", "horizontal_jump", "--suite", "grid", "--rows", "9999"],
+            "columns, rows and num_jumps must be at",
+        ),
+        (
+            ["evaluate", "horizontal_jump", "--suite", "consecutive", "--jumps-per-trial", "9999"],
+            "jumps_per_trial must",
+        ),
     ],
 )
 def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkeypatch, args, message):

@@ -92,7 +92,7 @@ def test_update_returns_true_when_all_episodes_ended():  # 3: index of any termi
         (lambda: EpisodeFlags(num_episodes=0), "num_episodes must be at least 1"),
         (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
         (lambda: EpisodePlayFlags(command=(float("nan"),)), "command takes up to 4 finite numbers"),
-        (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \(0, 600\]"),
+        (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \[0.1, 600\]"),
     ],
 )
 def test_refuses_invalid_settings(make, message):

@@ -20,6 +20,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
 from jumper_warp.rl.stop_request import StopRequest
+from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
@@ -358,6 +359,23 @@ def test_trains_with_the_largest_seed(cfg):
 def test_log_root_may_be_a_string(cfg):
     result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), max_iterations=1), make_env)
     assert result.folder.parent == cfg.log_root / "push"
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"WORLD_SIZE": "x"}, "WORLD_SIZE must be a whole number of 1 to 100000, got 'x'"),
+        ({"WORLD_SIZE": "0"}, "WORLD_SIZE must be a whole number of 1 to"),
+        ({"WORLD_SIZE": "2", "RANK": "2"}, "RANK must be a whole number of 0 to 1, got '2'"),
+        ({"LOCAL_WORLD_SIZE": "-1", "OMP_NUM_THREADS": None}, "LOCAL_WORLD_SIZE must be a whole number of 1 to"),
+        ({"WORLD_SIZE": "2", "RANK": "0"}, "MASTER_ADDR expected, but not set; start several processes with torchrun"),
+    ],
+)
+def test_refuses_invalid_variables_of_torchrun(cfg, monkeypatch, variables, message):
+    for name, value in ({"MASTER_ADDR": None} | variables).items():
+        monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match=message):
+        train(cfg, must_not_be_built)
 
 
 def test_refuses_a_missing_device(cfg, monkeypatch):
