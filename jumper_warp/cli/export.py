@@ -53,7 +53,7 @@ def export(cfg: ExportCfg) -> Path:
 
     source = Path(newest_run(cfg.source))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
-        checked_folder(cfg.out)
+        checked_folder(cfg.out, cfg.overwrite)
     trained = is_run(source)
     policy = open_policy(source, newest=cfg.newest)
     if trained:

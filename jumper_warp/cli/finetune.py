@@ -36,16 +36,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         from jumper_warp.evaluation.finetuning import finetune
         from jumper_warp.policies.folder import checked_folder, save_policy
         from jumper_warp.policies.runs import open_policy
-        from jumper_warp.policies.spec import PolicyError
         from jumper_warp.utils.locks import write_lock
         from jumper_warp.utils.runtime import configure_device
 
         policy = open_policy(name)
-    out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"))
+    out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"), parsed.overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
     with write_lock(out, out.with_name(f".{out.name}.lock")):  # beside the folder, which is replaced as a whole
-        if out.exists() and not parsed.overwrite:
-            raise PolicyError(f"{out} exists; overwrite replaces it")
         configure_device(parsed.device, parsed.threads)
         log = partial(print, file=sys.stderr if parsed.json else sys.stdout)
         policy, record = finetune(policy, parsed, modules, log)

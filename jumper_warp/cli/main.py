@@ -10,6 +10,7 @@ import errno
 import importlib
 import inspect
 import io
+import itertools
 import os
 import sys
 import traceback
@@ -85,6 +86,7 @@ def dispatch(args: Sequence[str]) -> None:
     if name not in COMMANDS:
         near = suggestion(name, COMMANDS) or f"; there are {', '.join(COMMANDS)}"
         raise UsageError(f"no command {name!r:.60}{near}")
+    check_not_empty(args)
     rest, files = split_task_modules(args[1:])
     modules = []
     try:
@@ -99,6 +101,14 @@ def dispatch(args: Sequence[str]) -> None:
         if message := user_file_error(folders, error):
             raise InputError(message) from error
         raise
+
+
+def check_not_empty(args: Sequence[str]) -> None:
+    """Raise UsageError if an argument is empty, such as an unset variable of a shell, or the value after `--flag=`."""
+    for before, arg in itertools.pairwise(["jumper", *args]):
+        flag, equals, value = arg.partition("=")
+        if not arg or (flag.startswith("--") and equals and not value):
+            raise UsageError(f"empty value of {flag}" if arg else f"empty value after {before}")
 
 
 def user_file_error(folders: Collection[str], error: Exception) -> str | None:
@@ -136,6 +146,7 @@ def parse(
     Raises InputError: a setting is out of range. Exits with 2 and tyro's message: there is no such flag, or a value is
     missing or of another type.
     """
+    check_not_empty(args)
     import tyro
 
     from jumper_warp.cli.flags import TASK_MODULE_FLAG, check_numbers, list_flags, print_help, wants_help

@@ -26,6 +26,7 @@ from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mea
 from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
 
+MOST_JUMPS = 100_000  # Largest number of jumps of a suite
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
@@ -77,6 +78,7 @@ class Grid(Suite):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
+        check_jumps(self.columns * self.rows * self.num_jumps, "columns, rows and num_jumps")
 
     @property
     def goals(self) -> np.ndarray:
@@ -143,6 +145,7 @@ class Consecutive(Suite):
         super().__post_init__()
         trials, jumps = self.num_trials, self.jumps_per_trial
         check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
+        check_jumps(trials * jumps, "num_trials and jumps_per_trial")
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run pairs and long sequences of jumps, plot the paths of the bases, and return the metrics."""
@@ -162,6 +165,11 @@ class Consecutive(Suite):
         plot_paths(run.folder / "paths.png", parts, PAIRS, words)
         run.settings["jumps_in_a_row"] = self.jumps_per_trial
         return consecutive_metrics(*logs)
+
+
+def check_jumps(count: int, factors: str) -> None:
+    """Raise InputError if a suite would have more than MOST_JUMPS jumps; count: product of the settings `factors`."""
+    check(count <= MOST_JUMPS, f"the product of {factors} must be at most {MOST_JUMPS}, got {count}")
 
 
 def running_positions(jumps: JumpLog) -> np.ndarray:

@@ -45,10 +45,7 @@ def save_policy(
     overwrite: whether to replace an existing policy with all its files.
     Raises PolicyError: the folder exists and overwrite is not set, or it is not a policy's; or a name is malformed.
     """
-    folder = checked_folder(folder)
-    if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
-        reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
-        raise PolicyError(f"{folder} exists{reason}")
+    folder = checked_folder(folder, overwrite)
     config = {**source_versions(), **policy.config}
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
@@ -74,14 +71,19 @@ def save_policy(
     return folder
 
 
-def checked_folder(folder: Path) -> Path:
-    """Return a path for a policy's folder, after checking that it has no suffix of a file.
+def checked_folder(folder: Path, overwrite: bool) -> Path:
+    """Return a path for a policy's folder, after checking that a policy can be written there.
 
-    Raises PolicyError: it has one.
+    Raises PolicyError: it has no name or the suffix of a file; it exists and overwrite is not set, or is no policy's.
     """
     folder = Path(folder)
+    if folder.name in ("", ".."):
+        raise PolicyError(f"a policy's folder needs a name, got {folder}")
     if folder.suffix.lower() in FILE_SUFFIXES:
         raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
+    if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
+        reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
+        raise PolicyError(f"{folder} exists{reason}")
     return folder
 
 

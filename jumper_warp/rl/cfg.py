@@ -182,6 +182,8 @@ class TrainCfg:
         if self.trainer not in ("ppo", "rsl-rl"):
             raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):
+            if getattr(self, name) == "":
+                raise InputError(f"{name} is empty: pass None to begin without it")
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.threads import available_threads
+from jumper_warp.utils.threads import available_threads, torchrun_variable
 
 NCCL = {"NCCL_NVLS_ENABLE": "0", "NCCL_GRAPH_REGISTER": "0"}
 """Defaults of NCCL's environment variables: no NVLink multicast, which some machines forbid, and no registration of
@@ -79,14 +79,16 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
     """Select the device, join the process group under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), and return the rank.
 
     device: torch device (default: a GPU if there is one); several ranks use cuda:LOCAL_RANK.
-    threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises InputError: there is no such device.
+    threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises InputError: there is no such device, or a
+    variable is missing or invalid.
     """
     selected = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if selected.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device {device} requested, but torch finds no GPU")
-    size = int(os.environ.get("WORLD_SIZE", "1"))
+    size = torchrun_variable("WORLD_SIZE")
+    index = torchrun_variable("RANK", 0, 0, size - 1) if size > 1 else 0
     if size > 1 and selected.type == "cuda":
-        selected = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        selected = torch.device("cuda", torchrun_variable("LOCAL_RANK", index, 0))
     elif selected.type == "cuda" and selected.index is None:
         selected = torch.device("cuda", 0)
     if selected.type == "cuda":
@@ -98,8 +100,11 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)
-        torch.distributed.init_process_group("nccl" if selected.type == "cuda" else "gloo")
-    return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, selected)
+        try:
+            torch.distributed.init_process_group("nccl" if selected.type == "cuda" else "gloo")
+        except ValueError as error:  # a variable is missing
+            raise InputError(f"{error}; start several processes with torchrun") from error
+    return Rank(index, size, selected)
 
 
 def gather_states(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:

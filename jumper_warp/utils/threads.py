@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 from jumper_warp.utils.errors import InputError
 
 MAX_THREADS = 1024  # Largest number of threads of a simulation
+MOST_PROCESSES = 100_000  # Largest number of processes of a training
 P = ParamSpec("P")
 T = TypeVar("T")
 FORKED = "a forked process cannot use CUDA: start it with multiprocessing.get_context('spawn')"
@@ -73,10 +74,23 @@ def locked(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def torchrun_variable(name: str, default: int = 1, least: int = 1, most: int = MOST_PROCESSES) -> int:
+    """Return the number in one of torchrun's environment variables, such as WORLD_SIZE, or `default` without it.
+
+    Raises InputError: it is not a whole number from `least` to `most`.
+    """
+    text = os.environ.get(name, str(default))
+    if not (text.isdecimal() and least <= int(text) <= most):
+        raise InputError(
+            f"the environment variable {name} must be a whole number of {least} to {most}, got {text!r:.40}"
+        )
+    return int(text)
+
+
 def available_threads() -> int:
     """Return the number of CPU cores for this process: its affinity, divided by torchrun's processes on the machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
+    return max(1, cores // torchrun_variable("LOCAL_WORLD_SIZE"))
 
 
 def checked_threads(threads: int | None) -> int:

@@ -67,6 +67,17 @@ def still(tmp_path_factory):
         (["evaluate", "velocity_flat"], "a task, not a policy; its policies: walking_flat"),
         (["sysid", "fit", "motions.npz"], "motions.npz: no such file (recorded motions)"),
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
+        (["finetune", "vertical_jump", "--out", "."], "a policy's folder needs a name, got ."),
+        (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.1, 600], got 0.001"),
+        (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.1, 600], got 0.006"),
+        (
+            ["evaluate", "horizontal_jump", "--suite", "grid", "--rows", "9999"],
+            "columns, rows and num_jumps must be at",
+        ),
+        (
+            ["evaluate", "horizontal_jump", "--suite", "consecutive", "--jumps-per-trial", "9999"],
+            "jumps_per_trial must",
+        ),
     ],
 )
 def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkeypatch, args, message):
@@ -74,6 +85,29 @@ def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkey
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]
+
+
+@pytest.mark.parametrize(
+    ("args", "place"),
+    [
+        (["train", "vertical-jump", "--resume", ""], "after --resume"),
+        (["train", "vertical-jump", "--init-policy="], "of --init-policy"),
+        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "after --log-root"),
+        (["train", ""], "after train"),
+        (["evaluate", "vertical_jump", "--out", ""], "after --out"),
+        (["evaluate", ""], "after evaluate"),
+        (["play", "--script", ""], "after --script"),
+        (["export", "vertical_jump", "--out="], "of --out"),
+        (["sysid", "fit", ""], "after fit"),
+        (["list", "--task-module", ""], "after --task-module"),
+    ],
+    ids=str,
+)
+def test_refuses_empty_values(capsys, tmp_path, monkeypatch, args, place):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *args)
+    assert (code, out, len(err)) == (2, "", 1) and not list(tmp_path.iterdir())
+    assert err == [f"jumper: empty value {place}"]
 
 
 def test_train_without_task_lists_tasks_and_exits_with_2(capsys):

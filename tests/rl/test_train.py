@@ -19,6 +19,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
 from jumper_warp.rl.stop_request import StopRequest
+from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
@@ -232,6 +233,8 @@ def test_each_rank_resumes_its_own_worlds(cfg):
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
         ({"trainer": "shac"}, "trainer must be ppo or rsl-rl, got 'shac'"),
+        ({"resume": ""}, "resume is empty"),
+        ({"init_policy": ""}, "init_policy is empty"),
     ],
 )
 def test_refuses_settings_out_of_range(change, message):
@@ -245,6 +248,28 @@ def test_every_logged_metric_can_be_the_best_metric(cfg):
     for name in metrics:
         TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     assert {"Train/mean_reward", "Perf/total_fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
+
+
+def must_not_be_built(num_envs, seed, device):
+    """Fail the test in place of making an environment."""
+    pytest.fail("the environment was built")
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"WORLD_SIZE": "x"}, "WORLD_SIZE must be a whole number of 1 to 100000, got 'x'"),
+        ({"WORLD_SIZE": "0"}, "WORLD_SIZE must be a whole number of 1 to"),
+        ({"WORLD_SIZE": "2", "RANK": "2"}, "RANK must be a whole number of 0 to 1, got '2'"),
+        ({"LOCAL_WORLD_SIZE": "-1", "OMP_NUM_THREADS": None}, "LOCAL_WORLD_SIZE must be a whole number of 1 to"),
+        ({"WORLD_SIZE": "2", "RANK": "0"}, "MASTER_ADDR expected, but not set; start several processes with torchrun"),
+    ],
+)
+def test_refuses_invalid_variables_of_torchrun(cfg, monkeypatch, variables, message):
+    for name, value in ({"MASTER_ADDR": None} | variables).items():
+        monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match=message):
+        train(cfg, must_not_be_built)
 
 
 def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():

@@ -8,6 +8,7 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from columns import COORDS, DOFS, LIN_VEL, MOTOR_DOFS, X, Z
+from jumper_warp.utils.errors import InputError
 from simulation_helpers import simulation
 from solver_helpers import BODIES, KNEE_V
 
