@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -38,7 +38,7 @@ class Suite(EvaluationArgs, ABC):
 
     name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
     kind: ClassVar[type[JumpEvaluation]] = PlaceEvaluation  # Evaluation of the tasks whose policies the suite accepts
-    paper: ClassVar[dict[str, float]] = {}  # Values in the paper of metrics with the same names
+    paper: ClassVar[Mapping[str, float]] = {}  # Values in the paper of metrics with the same names
     summary: ClassVar[tuple[str, ...]] = HEADLINES  # Keys of the metrics in the summary
     least: ClassVar[int] = 1  # Minimum number of jumps
 
