@@ -263,7 +263,7 @@ def test_flag_exists_for_each_setting_outside_terms(name):
 def test_task_fields_without_flags_hold_functions_or_names():
     flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
     names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation-suite", "metrics"} and not flags - names
+    assert names - flags == {"name", "state", "command", "evaluation", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])

@@ -319,8 +319,8 @@ def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
 
 
 def test_refuses_policy_of_other_task(tmp_path):
-    needed = "expected a policy with evaluation suite landing_position or omnidirectional or landing_position_mars"
-    message = rf"{needed}, vertical_jump \(task vertical-jump\) has apex_height"
+    needed = "expected a policy of a task with a PlaceEvaluation"
+    message = rf"{needed}, vertical_jump \(task vertical-jump\) has a HeightEvaluation"
     with pytest.raises(PolicyError, match=message):
         EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
@@ -336,7 +336,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "")
-    assert line.startswith("jumper: expected a policy with evaluation suite apex_height")
+    assert line.startswith("jumper: expected a policy of a task with a HeightEvaluation")
 
 
 @pytest.mark.parametrize(

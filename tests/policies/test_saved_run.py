@@ -163,9 +163,9 @@ def test_refuses_an_invalid_task_configuration(saved, change, message):
 
 def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
-    for version in (3, 5):  # the present one is 4
+    for version in (4, 6):  # the present one is 5
         config["env"]["task"]["version"] = version
-        with pytest.raises(PolicyError, match=f"has version {version}, expected version 4; commit 05fa856"):
+        with pytest.raises(PolicyError, match=f"has version {version}, expected version 5; commit 7f5b55c3"):
             restored_task(config)
 
 
