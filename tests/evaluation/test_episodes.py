@@ -157,6 +157,28 @@ def test_command_beyond_those_of_resets_is_named_in_one_line(policy, tmp_path, c
     assert "jumper: beyond the training of any-task: goal[0] 9 (resets sampled -" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("marker", ["goal", "peak_tilt"])
+def test_metrics_and_goal_are_of_the_state_at_the_end_of_each_episode(marker):
+    """The first world's episode ends after a step; then its state is that of another episode."""
+    kinds = {"mean": "peak_tilt", "max": "peak_tilt", "rate": "jumps"}
+    own = tuple(EpisodeMetric(kind, name, kind) for kind, name in kinds.items())
+    task = replace(TASK, evaluation=EpisodeEvaluation(own, marker))
+    log, env, goal = EpisodeFlags(4, command=(0.5, 0.1)).log(task, 0), StubEnv(), np.zeros((4, 3))
+    env.set(goal=goal, peak_tilt=np.zeros(4), jumps=np.zeros(4, dtype=int))
+    log.begin(env)
+    env.set(termination=[0, -1, -1, -1], goal=goal + 1.0, peak_tilt=[0.4, 0.2, 0.1, 0.1], jumps=[1, 0, 0, 0])
+    log.record_step(env)
+    env.set(termination=[-1, 0, 0, 0], goal=goal + 2.0, peak_tilt=[9.0, 0.2, 0.1, 0.1], jumps=[0, 0, 2, 0])
+    assert log.record_step(env)
+    measured, marks = values(episode_metrics(log)), log.marks()
+    assert [measured[kind] for kind in kinds] == pytest.approx([0.2, 0.4, 0.5])
+    assert log.columns()["jumps"] == [1, 0, 2, 0] and list(log.main_metrics) == ["mean", "max", "rate"]
+    if marker == "goal":
+        assert marks["goals"].shape == (4, 1, 3) and marks["goals"][:, 0, 0].tolist() == [1.0, 2.0, 2.0, 2.0]
+    else:
+        assert marks["heights"].tolist() == [0.4, 0.2, 0.1, 0.1]
+
+
 def test_commands_are_named_by_their_labels_without_slashes():
     """A slash would end a name in the viewer's tree."""
     walk, turn = make_task("velocity-flat"), make_task("attitude")
@@ -172,7 +194,7 @@ def test_commands_are_named_by_their_labels_without_slashes():
      {"labels": ("x [m]",), "least": (0.0, 0.0)}, {"optional": 1}],
 )  # fmt: skip
 def test_refuses_labels_of_a_command_that_do_not_fit(wrong):
-    with pytest.raises(InputError, match="a command has 1 to 4 labels with units"):
+    with pytest.raises(InputError, match="a command has 1 to 4 distinct labels with units"):
         Command(make_task("velocity-flat").command.set, **wrong)
 
 

@@ -284,8 +284,9 @@ def test_standing_policy_has_error_of_full_distance(policy, tmp_path):
 
 
 def test_refuses_policy_of_other_task(tmp_path):
-    found = r"vertical_jump \(task vertical-jump\) has a HeightEvaluation"
-    with pytest.raises(PolicyError, match=f"expected a policy of a task with a PlaceEvaluation, {found}"):
+    needed = "expected a policy of a task with a PlaceEvaluation"
+    message = rf"{needed}, vertical_jump \(task vertical-jump\) has a HeightEvaluation"
+    with pytest.raises(PolicyError, match=message):
         EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
 
