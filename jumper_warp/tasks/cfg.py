@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from jumper_warp.kernels.mdp.durations import NEVER
 from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
 from jumper_warp.kernels.mdp.random import RngStream
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
@@ -41,6 +42,8 @@ TASK_BOUNDS = {
     "reward_floor": (-MOST_SETTING, MOST_SETTING, ""),
 }  # fmt: skip
 """Smallest and largest value of settings of a task, and unit."""
+OF_EPISODE, OF_BASE = ("done", "termination", "level"), ("base_pos", "base_vel", "base_quat")
+"""Names in `Env.task_arrays` that are no fields of the task's state, and that no field may have."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +172,9 @@ class TaskCfg(Copyable):
         if steps is None or steps.type not in (int, wp.int32):
             missing = f"the state {shown_type(self.state)} of {self.name} needs a field steps: int"
             raise InputError(f"{place_of(self.state)}: {missing}, the policy steps of the episode")
+        if reserved := [name for name in (*OF_EPISODE, *OF_BASE) if name in self.state.vars]:
+            also = f"`Env.task_arrays` has other values of this name, so {shown_type(self.state)} must not"
+            raise InputError(f"{place_of(self.state)}: field {reserved[0]!r}: {also}")
         if self.reset.settings is not None:
             check_values(f"{self.name} reset.settings", self.reset.settings, 1.0 / 60.0)  # [s]
         for i, level in enumerate(self.levels):
@@ -216,7 +222,8 @@ class TaskCfg(Copyable):
 
         step_dt [s]: policy step.
         """
-        limits = [term.numbers["steps"] * step_dt for term in self.terminations if term.func is too_long]
+        steps = [term.numbers["steps"] for term in self.terminations if term.func is too_long]
+        limits = [number * step_dt for number in steps if number < NEVER]
         limits.append(getattr(self.reset.settings, "max_episode_length_s", 0.0))
         return min((limit for limit in limits if limit), default=0.0)
 

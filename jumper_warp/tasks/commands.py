@@ -22,6 +22,7 @@ class CommandValue:
     name: str  # With its unit, as `x [m]`
     least: float = -math.inf  # Smallest allowed number, in its unit
     optional: bool = False  # Whether it may be omitted, which means 0; only trailing numbers may be
+    steps: bool = False  # Whether it is a whole number of policy steps, where 2^31 or more, as infinity, means never
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ LAYOUTS: dict[Function, CommandLayout] = {
             CommandValue("x [m]"),
             CommandValue("y [m]"),
             CommandValue("height [m]", least=0.0),
-            CommandValue("policy step of the command [1]", least=0.0, optional=True),
+            CommandValue("policy step of the command [1]", least=0.0, optional=True, steps=True),
         )
     ),
     set_velocity: CommandLayout(
@@ -79,11 +80,14 @@ def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: n
     subject = f"commands of {task.name} are {layout}"
     if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in layout.counts]:
         raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
-    if not np.isfinite(commands).all():
+    durations = np.array([value.steps for value in layout.values[: commands.shape[-1]]])
+    if not (np.isfinite(commands) | (durations & np.isinf(commands))).all():
         raise InputError("commands must be finite")
     rows = np.broadcast_to(commands, (num_envs, commands.shape[-1]))[worlds]
     for value, column in zip(layout.values, rows.T, strict=False):
         if (column < value.least).any():
             raise InputError(f"{subject}: {value.name} must be at least {value.least:g}, got {column.min():g}")
+        if value.steps and (fraction := column[np.trunc(column) != column]).size:
+            raise InputError(f"{subject}: {value.name} must be a whole number, got {fraction[0]:g}")
     if layout.nonzero and (rows == 0.0).all(axis=1).any():
         raise InputError(f"{subject}: not all may be 0")

@@ -323,8 +323,8 @@ def test_a_changed_parameter_of_a_term_acts_in_captured_steps():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
-        ("rewards.orientation.weight", 1e39, "weight must be finite, got 1e\\+39, too large for float32"),
+        ("rewards.orientation.weight", NAN, "'weight' must be a finite number within 1e\\+09, got nan"),
+        ("rewards.orientation.weight", 1e39, "'weight' must be a finite number within 1e\\+09, got 1e\\+39"),
         ("rewards.orientation.depth", 1.0, "no number 'depth' of a rewards term 'orientation'"),
         ("rewards.levitation.weight", 1.0, "no number 'weight' of a rewards term 'levitation'"),
         ("prizes.orientation.weight", 1.0, "no number 'weight' of a prizes term 'orientation'"),
