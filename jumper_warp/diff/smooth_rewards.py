@@ -161,13 +161,13 @@ SMOOTH: dict[str, Smooth] = {
 
 
 def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
-    """Return the differentiable part of the reward: the weighted sum (n,) of the terms in `SMOOTH`.
+    """Return the differentiable part of the reward: the weighted sum (n,) of the terms in `SMOOTH`, but of weight 0.
 
     Times the policy step where `scale_by_dt` is set.
     """
     total = torch.zeros_like(context.goal)
     for term in task.rewards:
-        if term.func.key in SMOOTH:
+        if term.func.key in SMOOTH and term.numbers["weight"] != 0.0:
             time = context.step_dt if term.options["scale_by_dt"] else 1.0
             total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](context, term.numbers)
     return total

@@ -204,15 +204,15 @@ class TaskRuntime:
     def _state_metrics(self) -> dict[str, float]:
         """Return the metrics of the training log that come from the worlds' task states, and clear their sums.
 
-        A `StateMetric` is the sum of `field` over the sum of `per`, or the mean.
+        A `StateMetric` is the sum of `field` over the sum of `per`, or the mean; values that are not finite count as 0.
         """
         metrics, values_by_name = self.task.metrics, {}
         if not metrics:
             return values_by_name
         states = records(self.states).copy()
         for metric in metrics:
-            values = states[metric.field].astype(np.float64)
-            total = 0.0 if metric.per is None else float(states[metric.per].astype(np.float64).sum())
+            values, per = (_finite(states, field) for field in (metric.field, metric.per or metric.field))
+            total = 0.0 if metric.per is None else float(per.sum())
             mean = float(values.mean()) if metric.per is None else 0.0
             values_by_name[metric.name] = float(values.sum()) / total if total else mean
         for metric in metrics:
@@ -220,6 +220,11 @@ class TaskRuntime:
                 states[metric.field] = states[metric.per] = 0.0
         self.states.assign(wp.array(states, dtype=self.task.state, device=self.device))
         return values_by_name
+
+
+def _finite(states: np.ndarray, field: str) -> np.ndarray:
+    """Return a field of task states, (num_envs,) float64, with 0 in place of values that are not finite."""
+    return np.nan_to_num(states[field].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
