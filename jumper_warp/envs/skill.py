@@ -23,7 +23,7 @@ from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.dumps import NonFiniteValue
-from jumper_warp.utils.kernels import Kernel, records
+from jumper_warp.utils.kernels import Kernel, content_hash, records
 from jumper_warp.utils.threads import locked
 
 _KERNELS: dict[tuple, Kernel] = {}
@@ -250,8 +250,8 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
 def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
     """Return the kernel that `make` builds from `source`, built once and cached.
 
-    Key: `make` and key_parts, all parts of source that the kernel depends on.
+    Key: `make` and key_parts, all parts of source that the kernel depends on, with the code of their functions.
     """
-    if (key := (make, *key_parts)) not in _KERNELS:
+    if (key := (make, *key_parts, content_hash(*key_parts))) not in _KERNELS:
         _KERNELS[key] = make(source)
     return _KERNELS[key]
