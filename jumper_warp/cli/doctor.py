@@ -38,11 +38,17 @@ class DoctorCfg:
     """
 
     json: bool = False  # Print JSON
+    task: str = ""
+    """Instead run each of your own terms of this task alone, in a process of its own that ends at an index outside an
+    array, and name the terms that fail."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Print the state of the installation; exits with code 1 if a device fails. modules: unused."""
     cfg = parse(DoctorCfg, "doctor", args)
+    if cfg.task:
+        check_task(cfg.task)
+        return
     import warp as wp
 
     from jumper_warp.utils.runtime import init_warp, source_versions
@@ -60,6 +66,19 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     print(json.dumps(content, indent=2) if cfg.json else "\n".join(lines_of(content)))
     if any(device["error"] for device in content["devices"]):
         sys.stdout.flush()
+        raise SystemExit(FAULT)
+
+
+def check_task(name: str) -> None:
+    """Run each of the user's terms of a task alone, and print the results; exits with code 1 if one fails."""
+    from jumper_warp.envs.term_check import check_terms
+    from jumper_warp.registry import make_task
+
+    failed = False
+    for term, failure in check_terms(make_task(name)):
+        print(f"{term}: {failure or 'ok'}", flush=True)
+        failed = failed or bool(failure)
+    if failed:
         raise SystemExit(FAULT)
 
 

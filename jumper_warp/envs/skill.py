@@ -15,7 +15,7 @@ from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.non_finite import NO_WORLD, NonFinite
-from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
+from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, ObservationColumn, make_observe_kernel
 from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
 from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
@@ -89,7 +89,8 @@ class TaskRuntime:
                                     slot.clip, oldest + j, width, slot.history, delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
-        self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
+        table = np.array(columns, dtype=np.int32).reshape(-1, len(ObservationColumn.vars))
+        self.columns = wp.array(table.T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.params.slots[f"observations.{group}"]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         allocate(arrays, ("raw",), (len(columns), n), float, self.device)

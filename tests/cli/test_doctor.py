@@ -7,6 +7,7 @@ import warp as wp
 
 from cli_helpers import run
 from jumper_warp.cli import doctor
+from jumper_warp.envs import term_check
 from jumper_warp.envs.env import Env
 
 
@@ -36,6 +37,13 @@ def test_json_has_versions_folders_and_the_rate_of_each_device(capsys, working_f
     assert folders["working"]["path"] == str(working_folder) and folders["working"]["writable"] is True
     assert folders["kernels"]["size_bytes"] > 0 and content["threads"]["simulation"] >= 1
     assert list(working_folder.iterdir()) == []
+
+
+def test_terms_of_a_task_that_fail_are_named_and_the_exit_code_is_1(capsys, monkeypatch):
+    found = {"reset": "", "rewards.mine": "killed by SIGABRT"}
+    monkeypatch.setattr(term_check, "check_terms", lambda task: found.items() if task.name == "attitude" else ())
+    code, out, err = run(capsys, "doctor", "--task", "attitude")
+    assert (code, out.splitlines(), err) == (1, ["reset: ok", "rewards.mine: killed by SIGABRT"], [])
 
 
 def test_device_that_fails_is_reported_and_the_exit_code_is_1(capsys, monkeypatch):
