@@ -79,11 +79,21 @@ def test_training_has_a_number_of_worlds_and_iterations_that_a_machine_can_hold(
         ("train vertical-jump --env.motors.lateral.kp 1e5", "motor kp must be in 0 to 10000 N m/rad, got 100000.0"),
         ("sysid excite --seconds 1e9", "--seconds must be at most 3600, got 1000000000.0"),
         ("sysid excite --noise.angle nan", "--noise.angle must be a finite number, got nan"),
+        (
+            "train velocity-flat --env.levels.0.resampling-time-range nan 1",
+            "resampling_time_range must be (lower, upper)",
+        ),
+        ("train vertical-jump --env.terminations.too-long.steps -1", "'steps' must be 0 or more, infinite for never"),
     ],
 )
 def test_flag_beyond_what_a_machine_can_hold_is_refused(args, message, capsys):
     code, _, err = run(capsys, *args.replace("NINES", "9" * 20).split())
     assert code == 2 and len(err) == 1 and message in err[0]
+
+
+def test_flag_of_a_duration_may_be_infinite(capsys):
+    args = "train vertical-jump --env.terminations.too-long.steps inf --init-policy /none --num-envs 2 --device cpu"
+    assert run(capsys, *args.split())[2] == ["jumper: /none: no such folder (policy)"]
 
 
 def test_flag_of_an_experiment_is_bounded_likewise(monkeypatch):
