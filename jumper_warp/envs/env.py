@@ -249,7 +249,7 @@ class Env(Stages):
         """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
         name: "section.term.number" such as `rewards.jump_height.weight`; skill: index of the task.
-        Raises InputError (a ValueError): no such number or skill, or a value that is not finite.
+        Raises InputError (a ValueError): no such number or skill, or a value that the task's configuration refuses.
         """
         self._check_skill(skill)
         self.skills[skill].params.set(name, value)
@@ -264,7 +264,7 @@ class Env(Stages):
 
         commands: one row a world or one for all, columns as in `jumper_warp.tasks.commands.layout_of`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
-        Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
+        Raises InputError (a ValueError): values of another shape, out of bounds or, other than policy steps, infinite.
         """
         n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])

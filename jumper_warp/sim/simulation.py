@@ -183,7 +183,8 @@ class Simulation:
         self.physics.forget(self._mask)
         inputs = [self._mask, self._start]
         self._launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, [state_arrays(self.state)])
-        results = [self.target, self._safe_target, self.torque, self.paw_force, self.peak_force]
+        forces = [self.torque, self.paw_force, self.peak_force, self.physics.peak_paw_force]
+        results = [self.target, self._safe_target, *forces]
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
