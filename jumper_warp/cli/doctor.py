@@ -29,10 +29,17 @@ class DoctorCfg:
     The exit code is 1 if a device fails. Add the output to a bug report.
     """
 
+    task: str = ""
+    """Instead run each of your own terms of this task alone, in a process of its own that ends at an index outside an
+    array, and name the terms that fail."""
+
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Print versions, and the result of a step on each device; exits with code 1 if one fails. modules: unused."""
-    parse(DoctorCfg, "doctor", args)
+    cfg = parse(DoctorCfg, "doctor", args)
+    if cfg.task:
+        check_task(cfg.task)
+        return
     import warp as wp
 
     from jumper_warp.utils.runtime import init_warp, source_versions
@@ -52,6 +59,19 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
             failed = True
             text = f"FAILED: {type(error).__name__}: {' '.join(str(error).split()):.200}"
         print(f"{device!s:<20}{text}", flush=True)
+    if failed:
+        raise SystemExit(FAULT)
+
+
+def check_task(name: str) -> None:
+    """Run each of the user's terms of a task alone, and print the results; exits with code 1 if one fails."""
+    from jumper_warp.envs.term_check import check_terms
+    from jumper_warp.registry import make_task
+
+    failed = False
+    for term, failure in check_terms(make_task(name)):
+        print(f"{term}: {failure or 'ok'}", flush=True)
+        failed = failed or bool(failure)
     if failed:
         raise SystemExit(FAULT)
 

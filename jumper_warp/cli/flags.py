@@ -21,6 +21,8 @@ from jumper_warp.utils.errors import InputError, suggestion
 
 LARGEST = 2.0**31  # Largest absolute value of a number in a flag
 MOST_TRIALS = 100_000  # Largest number of jumps, walks or robots, which needs some 10 GB
+DURATIONS = ("resampling-time-range", "interval-range-s", "steps", "idle-steps")
+"""Flags of a task that may be infinite, for never; the task checks them."""
 FLAG_LIMITS = {"num-envs": MOST_WORLDS, "num-steps": LARGEST, "trials": MOST_TRIALS, "states": MOST_TRIALS,
                "repeats": 10_000, "seconds": 3600.0}  # fmt: skip
 """Largest value of a number in a flag by the last part of its name."""
@@ -160,11 +162,13 @@ def help_field(flag: Flag) -> tuple[str, Any, Any]:
 def check_numbers(settings: Any) -> None:
     """Raise InputError for a number in parsed flags that is too large or not finite.
 
-    settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others.
+    settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others, none for durations of a task.
     """
     for flag in list_flags(settings, described=False):
         name = flag.name.split(".")[-1]
         limit = FLAG_LIMITS.get(name, MOST_TRIALS if name.startswith("num-") else LARGEST)
+        if flag.name.startswith("env.") and name in DURATIONS:
+            continue
         for number in flag.default if isinstance(flag.default, tuple) else (flag.default,):
             if isinstance(number, float) and not math.isfinite(number):
                 raise InputError(f"--{flag.name} must be a finite number, got {number}")

@@ -117,7 +117,7 @@ class Rollout(Uncopied):
         tolerance: float | None = None,
         threads: int | None = None,
     ):
-        check_step(dt, substeps)
+        substeps = check_step(dt, substeps)
         every = substeps if every is None else every
         if every not in range(1, substeps + 1) or substeps % every != 0:
             raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")

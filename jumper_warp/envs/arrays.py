@@ -65,7 +65,8 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
     allocate(episode, ("reward", "done", "timeout"), num_envs, float, device)
     allocate(episode, ("terminated", "truncated"), num_envs, wp.bool, device)
     episode.step_count = wp.full(num_envs, FIRST_STEP_COUNT, dtype=int, device=device)
-    episode.requested_task.fill_(-1)
+    for array in (episode.requested_task, episode.termination):
+        array.fill_(-1)
     return episode
 
 

@@ -30,12 +30,12 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.dynamics import advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
-from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
-from jumper_warp.utils.checks import check_count, check_seed
+from jumper_warp.utils.checks import check_count, check_flags, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, loading_kernels, records
@@ -106,15 +106,14 @@ class Env(Stages):
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
         """
-        check_count("num_envs", num_envs)
-        check_count("refine", refine)
-        check_seed(seed)
+        num_envs, refine, seed = check_count("num_envs", num_envs), check_count("refine", refine), check_seed(seed)
+        check_flags(randomize=randomize, noise=noise, auto_reset=auto_reset)
         if stream not in PURPOSES:
             raise InputError(f"stream must be one of {', '.join(PURPOSES)}, got {stream!r:.40}")
         self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self.overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
+        self.handovers, self.overlay, self.conditions = tuple(handovers), robot, (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         if robot is not None and not isinstance(robot, RobotOverlay):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
@@ -174,14 +173,22 @@ class Env(Stages):
         if worlds is not None and not self._started:
             raise RuntimeError("reset all worlds before the first reset of selected worlds")
         if seed is not None:
-            check_seed(seed)
-            self._start_over(seed)
+            self._start_over(check_seed(seed))
         self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # `evaluation_reset` compiles no reset kernel
         self._advance_rng(mask)
         self._reset_worlds(self._part(), mask)
         self._observe(self._part(), after_reset=int(worlds is not None))
+        self._clear_results(mask)
         return self._step.obs, {}
+
+    def _clear_results(self, mask: wp.array) -> None:
+        """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""
+        begun, episodes = wp.to_torch(mask) != 0.0, self.episodes
+        for name in ("reward", "done", "timeout", "terminated", "truncated", "termination"):
+            wp.to_torch(getattr(episodes, name)).masked_fill_(begun, -1 if name == "termination" else 0)
+        for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):
+            wp.to_torch(array).masked_fill_(begun, 0.0)
 
     @locked
     def use_reset_mask(self) -> torch.Tensor:
@@ -242,7 +249,7 @@ class Env(Stages):
         """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
         name: "section.term.number" such as `rewards.jump_height.weight`; skill: index of the task.
-        Raises InputError (a ValueError): no such number or skill, or a value that is not finite.
+        Raises InputError (a ValueError): no such number or skill, or a value that the task's configuration refuses.
         """
         self._check_skill(skill)
         self.skills[skill].params.set(name, value)
@@ -257,7 +264,7 @@ class Env(Stages):
 
         commands: one row a world or one for all, columns as in the `labels` of `Command`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
-        Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
+        Raises InputError (a ValueError): values of another shape, out of bounds or, other than policy steps, infinite.
         """
         n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
@@ -275,8 +282,9 @@ class Env(Stages):
         self._launch(default_pose_kernel, n, inputs)
         self._clear_history(self._part(), mask)
         self._set_commands(mask, 1, values, headings)
+        self._observe(self._part(), after_reset=int(worlds is not None))
+        self._clear_results(mask)
         self.episodes.done.zero_()
-        self._observe(self._part(), after_reset=1)
 
     @locked
     def command(self, commands: Any, worlds: Any = None) -> None:
@@ -323,7 +331,7 @@ class Env(Stages):
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
-        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
+        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in OF_EPISODE}
 
     @locked
     def snapshot(self) -> Snapshot:
@@ -395,13 +403,13 @@ class Env(Stages):
             "policy_dt_s": self.step_dt,
             "contact_tolerance_m_s": CONTACT_TOLERANCE,
             "solver": type(self.sim.solver).__name__,
-            "randomize": self._conditions[0],
-            "noise": self._conditions[1],
+            "randomize": self.conditions[0],
+            "noise": self.conditions[1],
             "quaternion_order": "xyzw",
         }
         if self.overlay is not None:
             config = {"robot": self.overlay.to_json(), **config}
-            config |= {"ranges": ranges_of(self.task, self.overlay)} if self._conditions[0] else {}
+            config |= {"ranges": ranges_of(self.task, self.overlay)} if self.conditions[0] else {}
         if len(self.tasks) == 1:
             return config
         return {

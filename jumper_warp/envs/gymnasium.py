@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -18,7 +19,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.utils.checks import MOST_SEED, check_count
+from jumper_warp.utils.checks import MOST_SEED, check_count, check_flags
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.autoreset_mode = _checked_mode(autoreset_mode)
         _check_size(render_size)
-        check_count("render_envs", render_envs)
+        render_envs = check_count("render_envs", render_envs)
+        check_flags(all_groups=all_groups, tensors=tensors)
         if not env.auto_reset:
             raise InputError("Gymnasium's adapter needs an environment with auto_reset")
         if len(env.tasks) > 1:
@@ -290,7 +292,7 @@ def _checked_mode(mode: Any) -> AutoresetMode:
 
 def _check_size(size: tuple[int, int]) -> None:
     """Raise InputError unless size is a width and a height of 16 to 7680 px."""
-    if not (len(size) == 2 and all(isinstance(length, int) and 16 <= length <= 7680 for length in size)):
+    if not (len(size) == 2 and all(isinstance(length, Integral) and 16 <= length <= 7680 for length in size)):
         raise InputError(f"render_size must be a width and a height of 16 to 7680 px, got {size}")
 
 

@@ -15,7 +15,7 @@ from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.non_finite import NO_WORLD, NonFinite
-from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
+from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, ObservationColumn, make_observe_kernel
 from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
 from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
@@ -23,7 +23,7 @@ from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.dumps import NonFiniteValue
-from jumper_warp.utils.kernels import Kernel, records
+from jumper_warp.utils.kernels import Kernel, content_hash, records
 from jumper_warp.utils.threads import locked
 
 _KERNELS: dict[tuple, Kernel] = {}
@@ -89,7 +89,8 @@ class TaskRuntime:
                                     slot.clip, oldest + j, width, slot.history, delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
-        self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
+        table = np.array(columns, dtype=np.int32).reshape(-1, len(ObservationColumn.vars))
+        self.columns = wp.array(table.T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.params.slots[f"observations.{group}"]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         allocate(arrays, ("raw",), (len(columns), n), float, self.device)
@@ -204,15 +205,15 @@ class TaskRuntime:
     def _state_metrics(self) -> dict[str, float]:
         """Return the metrics of the training log that come from the worlds' task states, and clear their sums.
 
-        A `StateMetric` is the sum of `field` over the sum of `per`, or the mean.
+        A `StateMetric` is the sum of `field` over the sum of `per`, or the mean; values that are not finite count as 0.
         """
         metrics, values_by_name = self.task.metrics, {}
         if not metrics:
             return values_by_name
         states = records(self.states).copy()
         for metric in metrics:
-            values = states[metric.field].astype(np.float64)
-            total = 0.0 if metric.per is None else float(states[metric.per].astype(np.float64).sum())
+            values, per = (_finite(states, field) for field in (metric.field, metric.per or metric.field))
+            total = 0.0 if metric.per is None else float(per.sum())
             mean = float(values.mean()) if metric.per is None else 0.0
             values_by_name[metric.name] = float(values.sum()) / total if total else mean
         for metric in metrics:
@@ -220,6 +221,11 @@ class TaskRuntime:
                 states[metric.field] = states[metric.per] = 0.0
         self.states.assign(wp.array(states, dtype=self.task.state, device=self.device))
         return values_by_name
+
+
+def _finite(states: np.ndarray, field: str) -> np.ndarray:
+    """Return a field of task states, (num_envs,) float64, with 0 in place of values that are not finite."""
+    return np.nan_to_num(states[field].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
@@ -245,8 +251,8 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
 def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
     """Return the kernel that `make` builds from `source`, built once and cached.
 
-    Key: `make` and key_parts, all parts of source that the kernel depends on.
+    Key: `make` and key_parts, all parts of source that the kernel depends on, with the code of their functions.
     """
-    if (key := (make, *key_parts)) not in _KERNELS:
+    if (key := (make, *key_parts, content_hash(*key_parts))) not in _KERNELS:
         _KERNELS[key] = make(source)
     return _KERNELS[key]

@@ -49,7 +49,8 @@ def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, i
     """
     names = ("reset" if draws else "set_command", "step", "observe", "event")
     shared = [track_kernel, action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel]
-    kernels = [(kernels_of(task)[name], BLOCKS.get(name, BLOCK)) for name in names for task in tasks]
+    by_task = [kernels_of(task) for task in tasks]
+    kernels = [(kernels[name], BLOCKS.get(name, BLOCK)) for name in names for kernels in by_task]
     return [*kernels, *((kernel, BLOCK) for kernel in shared), (postprocess_obs_kernel, POSTPROCESS_BLOCK)]
 
 
@@ -72,6 +73,7 @@ class Stages(Uncopied):
     step_dt: float
     wp_device: wp.Device
     auto_reset: bool
+    conditions: tuple[bool, bool]  # `randomize` and `noise` of the constructor
     _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
@@ -83,6 +85,7 @@ class Stages(Uncopied):
         moves: differences of the robot from the described one.
         """
         n, device, sim = self.num_envs, self.wp_device, self.sim
+        wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
         self.skills = [

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.arrays import FIRST_STEP_COUNT
-from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays
+from jumper_warp.kernels.mdp.env import RING, Counters, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
@@ -28,31 +28,39 @@ MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "of
 """Names of the saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
 SEED = "seed"  # Key of the seed (`purpose_seed`)
+COUNTERS = "/counters."  # In the keys of episode statistics, after the task's name
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
     """Return the complete state of an environment as CPU tensors by name (waits for the device).
 
-    Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal` and `seed`.
-    Nominal parameters are saved as a fingerprint only, numbers of terms only if `Env.set` changed them, counters never.
+    Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal`, `seed`, and
+    "condition.name" of options. Nominal parameters are saved as a fingerprint only, numbers of terms only if `Env.set`
+    changed them.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
         fields = records(array)
         state |= {prefix + name: torch.from_numpy(np.array(fields[name])) for name in fields.dtype.names or ()}
-    return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(purpose_seed(env.stream, env.seed))}
+    state |= {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(purpose_seed(env.stream, env.seed))}
+    return state | _conditions(env)
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Restore a saved state of an environment, so that the following steps are bitwise the same.
 
-    Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed or version.
+    States of earlier versions lack counters and conditions: counters become 0.
+    Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
+    noise, refine or version.
     """
     if not isinstance(state, dict):
         raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
     tensors, saved = _tensors(env), {prefix: records(array).copy() for prefix, array in _records(env).items()}
+    conditions = _conditions(env)
+    counters = {name: torch.zeros_like(tensor, device="cpu") for name, tensor in tensors.items() if COUNTERS in name}
+    state = counters | conditions | state
     fields = {prefix + name: (prefix, name) for prefix, values in saved.items() for name in values.dtype.names or ()}
-    names = {*tensors, *fields, FINGERPRINT, SEED}
+    names = {*tensors, *fields, *conditions, FINGERPRINT, SEED}
     if names != state.keys():
         raise InputError(
             f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
@@ -74,6 +82,11 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
         check_tensor(state[field], torch.from_numpy(saved[prefix][name].copy()), f"saved {field}")
+    for name, own in conditions.items():
+        check_tensor(state[name], own, f"saved {name}")
+        if not torch.equal(state[name], own):
+            option = name.partition(".")[2]
+            raise InputError(f"saved with {option} {state[name].item()}, this environment has {option} {own.item()}")
     _check_indices(env, state)
     check_tensor(state[FINGERPRINT], nominal_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
@@ -107,6 +120,13 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
             raise InputError(f"saved {name} must be at most {most}, got {state[name].max().item()}")
 
 
+def _conditions(env: Stages) -> dict[str, torch.Tensor]:
+    """Return the options of an environment that a saved state depends on, by key, as tensors without dimensions."""
+    randomize, noise = env.conditions
+    options = {"randomize": randomize, "noise": noise, "substeps": env.sim.substeps}
+    return {f"condition.{name}": torch.tensor(value) for name, value in options.items()}
+
+
 def nominal_fingerprint(env: Stages) -> torch.Tensor:
     """Return the SHA-256 of all nominal robot parameters, (32,) uint8; it does not depend on the device."""
     digest = hashlib.sha256()
@@ -138,4 +158,5 @@ def _tensors(env: Stages) -> dict[str, torch.Tensor]:
         arrays |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
         own = {"timer": skill.timer, "changed": skill.params.changed, "episode_sum": skill.episode_sum}
         arrays |= {f"{skill.task.name}/{name}": array for name, array in own.items()}
+        arrays |= {f"{skill.task.name}{COUNTERS}{name}": getattr(skill.counters, name) for name in Counters.vars}
     return {name: wp.to_torch(array) for name, array in arrays.items() if isinstance(array, wp.array)}

@@ -20,7 +20,7 @@ COAST = 30  # Policy steps after the extension, within which the apex has passed
 LEVELS = np.repeat([0.0, np.nan, 1.0, -1.0, 0.0], [STAND, RAMP, HOLD, EXTEND, COAST])
 LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
 """[1] Action of the transversal motors at every policy step of the open-loop jump: 1 squat, -1 extension."""
-PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
+PUSH_PROBABILITY = "events.push.probability"
 
 
 def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
@@ -35,9 +35,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
 
     env.load_state_dict(initial_state)
     params = env.skills[0].task.params
-    pushes = {name: params.values[i] for name, i in params.names.items() if name.startswith(PUSH_PARAMS)}
-    for name in pushes:
-        env.set(name, 0.0)
+    if PUSH_PROBABILITY in params.names:
+        env.set(PUSH_PROBABILITY, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
     with phase(f"simulating {env.num_envs} open-loop jumps", len(LEVELS)) as advance:
@@ -48,8 +47,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
             if step >= STAND + RAMP + HOLD:
                 apex = np.fmax(apex, arrays["base_pos"][:, 2])
             advance()
-    for name, value in pushes.items():
-        env.set(name, value)
+    if PUSH_PROBABILITY in params.names:
+        env.set(PUSH_PROBABILITY, params.values[params.names[PUSH_PROBABILITY]])
     return np.where(diverged, np.nan, apex)
 
 

@@ -16,7 +16,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import TaskError
-from jumper_warp.utils.checks import check_seed
+from jumper_warp.utils.checks import check_flag_fields, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.streams import purpose_seed
@@ -52,7 +52,8 @@ class Conditions:
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
+        check_flag_fields(self)
         if self.latency:
             from jumper_warp.robot.model import PHYSICS_DT
 

@@ -12,6 +12,7 @@ from jumper_warp.utils.checks import (
     MAX_WIDTH,
     check_bounds,
     check_count,
+    check_flag_fields,
     check_not_negative,
     check_seed,
 )
@@ -95,6 +96,7 @@ class PpoCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of PPO is out of range."""
         check_bounds("ppo", self, PPO_BOUNDS)
+        check_flag_fields(self)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
         if self.symmetry not in ("off", "actor"):
@@ -173,12 +175,13 @@ class TrainCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
-        check_count("num_envs", self.num_envs)
+        check_flag_fields(self)
+        object.__setattr__(self, "num_envs", check_count("num_envs", self.num_envs))
         for name in ("max_iterations", "log_interval", "save_interval", "max_checkpoints"):
-            check_count(name, getattr(self, name), MOST_ITERATIONS)
+            object.__setattr__(self, name, check_count(name, getattr(self, name), MOST_ITERATIONS))
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
         if self.trainer not in ("ppo", "rsl-rl"):
             raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):

@@ -85,7 +85,7 @@ def build_model(
             unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
-    check_count("num_worlds", num_worlds)
+    num_worlds = check_count("num_worlds", num_worlds)
     if not 0.0 <= friction <= MAX_FRICTION:
         raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
     check_gravity(gravity)

@@ -123,7 +123,7 @@ def motor_arrays(
     Arrays are (12, num_worlds), without sensor offsets. module: `jumper_warp.kernels.actuation.motors` in either
     precision. Raises InputError for less than one world.
     """
-    check_count("num_worlds", num_worlds)
+    num_worlds = check_count("num_worlds", num_worlds)
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]

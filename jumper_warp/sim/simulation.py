@@ -23,6 +23,7 @@ from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
+from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked, stop_spinning
@@ -93,11 +94,12 @@ class Simulation(Uncopied):
     ):
         if solver not in ("jumper", "mujoco"):
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
+        check_flags(keep_momentum=keep_momentum, observe_forces=observe_forces, visuals=visuals)
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
-        check_step(dt, substeps)
+        num_worlds, substeps = check_count("num_worlds", num_worlds), check_step(dt, substeps)
         check_tolerance(tolerance)
         threads = checked_threads(threads)
         self.model = build_model(
@@ -182,7 +184,8 @@ class Simulation(Uncopied):
         self.physics.forget(self._mask)
         inputs = [self._mask, self._start]
         self._launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, [state_arrays(self.state)])
-        results = [self.target, self._safe_target, self.torque, self.paw_force, self.peak_force]
+        forces = [self.torque, self.paw_force, self.peak_force, self.physics.peak_paw_force]
+        results = [self.target, self._safe_target, *forces]
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:

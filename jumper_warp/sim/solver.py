@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from numbers import Integral
 from typing import Any
 
 import newton
@@ -29,6 +28,7 @@ from jumper_warp.robot.model import other_colliders
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.slices import WorldRange
+from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
@@ -39,12 +39,14 @@ MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
 TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
 
 
-def check_step(dt: float, substeps: int = 1) -> None:
-    """Raise InputError unless dt [s] is in the range DT, and substeps a whole number from 1 to MAX_SUBSTEPS."""
+def check_step(dt: float, substeps: int = 1) -> int:
+    """Return `substeps` as int.
+
+    Raises InputError: dt [s] not in the range DT, or substeps no whole number from 1 to MAX_SUBSTEPS.
+    """
     if not DT[0] <= dt <= DT[1]:
         raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
-    if not isinstance(substeps, Integral) or not 1 <= substeps <= MAX_SUBSTEPS:
-        raise InputError(f"substeps must be a whole number of 1 to {MAX_SUBSTEPS}, got {substeps!r:.40}")
+    return check_count("substeps", substeps, MAX_SUBSTEPS)
 
 
 def check_tolerance(tolerance: float) -> None:
@@ -227,7 +229,7 @@ class SolverJumper(SolverBase):
         observables: SolverBase.Observables | None, bodies: bool, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
         """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
-        check_step(dt, substeps)
+        substeps = check_step(dt, substeps)
         self._check_state("state_in", state_in)
         if state_out is not state_in:
             self._check_state("state_out", state_out)

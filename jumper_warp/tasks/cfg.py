@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.mdp.durations import NEVER
 from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
 from jumper_warp.kernels.mdp.random import RngStream
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
@@ -45,6 +46,8 @@ TASK_BOUNDS = {
 }  # fmt: skip
 """Smallest and largest value of settings of a task, and unit."""
 LABEL = re.compile(r"[^/\[\]]+ \[[^\[\]]+\]")  # Name of a command's value, with its unit
+OF_EPISODE, OF_BASE = ("done", "termination", "level"), ("base_pos", "base_vel", "base_quat")
+"""Names in `Env.task_arrays` that are no fields of the task's state, and that no field may have."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,10 @@ class Command(Copyable):
     resample: Function | None = None
     """Function that samples a command: @wp.func (robot, scene: Scene, state, level, rng: RngStream) -> state."""
     labels: tuple[str, ...] = ()
-    """Names of the one to four values, with units, as `x [m]`; empty: one to four values without names."""
+    """Names of the one to four values, with units, as `x [m]`; empty: one to four values without names.
+
+    A value whose name begins with `policy step` is a whole number; 2^31 or more, as infinity, means never.
+    """
     optional: int = 0
     """Number of values at the end of `labels` that may be omitted, which means 0."""
     least: tuple[float | None, ...] = ()
@@ -106,9 +112,13 @@ class Command(Copyable):
         subject, num_envs = f"commands of {task} are {self}", len(worlds)
         if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in self.counts]:
             raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
-        if not np.isfinite(commands).all():
+        steps = np.array([label.startswith("policy step") for label in self.labels] + 4 * [False])
+        if not (np.isfinite(commands) | (steps[: commands.shape[-1]] & np.isinf(commands))).all():
             raise InputError("commands must be finite")
         rows = np.broadcast_to(commands, (num_envs, commands.shape[-1]))[worlds]
+        for i in np.flatnonzero(steps[: rows.shape[1]]):
+            if (fraction := rows[:, i][np.trunc(rows[:, i]) != rows[:, i]]).size:
+                raise InputError(f"{subject}: {self.labels[i]} must be a whole number, got {fraction[0]:g}")
         for label, least, column in zip(self.labels, self.least, rows.T, strict=False):
             if least is not None and (column < least).any():
                 raise InputError(f"{subject}: {label} must be at least {least:g}, got {column.min():g}")
@@ -213,6 +223,9 @@ class TaskCfg(Copyable):
         if steps is None or steps.type not in (int, wp.int32):
             missing = f"the state {shown_type(self.state)} of {self.name} needs a field steps: int"
             raise InputError(f"{place_of(self.state)}: {missing}, the policy steps of the episode")
+        if reserved := [name for name in (*OF_EPISODE, *OF_BASE) if name in self.state.vars]:
+            also = f"`Env.task_arrays` has other values of this name, so {shown_type(self.state)} must not"
+            raise InputError(f"{place_of(self.state)}: field {reserved[0]!r}: {also}")
         if self.reset.settings is not None:
             check_values(f"{self.name} reset.settings", self.reset.settings, 1.0 / 60.0)  # [s]
         for i, level in enumerate(self.levels):
@@ -260,7 +273,8 @@ class TaskCfg(Copyable):
 
         step_dt [s]: policy step.
         """
-        limits = [term.numbers["steps"] * step_dt for term in self.terminations if term.func is too_long]
+        steps = [term.numbers["steps"] for term in self.terminations if term.func is too_long]
+        limits = [number * step_dt for number in steps if number < NEVER]
         limits.append(getattr(self.reset.settings, "max_episode_length_s", 0.0))
         return min((limit for limit in limits if limit), default=0.0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import inspect
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ import warp as wp
 from jumper_warp.tasks.copying import Struct
 from jumper_warp.utils.codegen import explained
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import content_hash
 from jumper_warp.utils.sources import PROJECT_PREFIX
 from jumper_warp.utils.threads import locked
 
@@ -70,10 +72,39 @@ def check_function(
     if not is_own(func):
         return
     with explained(takes):
-        returned = _returned(func, tuple(takes))
+        returned = _returned(func, tuple(takes), content_hash(func))
     if not may_return(returned):
         found = f"the function must return {returns}, it returns {shown_type(returned)}"
         raise InputError(f"{place_of(func)}: {where}: {found}")
+    for each in _with_called(func):
+        if _may_end_without_result(each):
+            name = each.key.rsplit(".", 1)[-1]
+            raise InputError(f"{place_of(each)}: {where}: {name} ends without `return` in some cases, add one")
+
+
+def _with_called(func: Any) -> set[Any]:
+    """Return a Warp function and all functions from outside the project that it calls, directly or not."""
+    found, rest = set(), [func]
+    while rest:
+        each = rest.pop()
+        if each not in found and not each.is_builtin() and is_own(each):
+            found.add(each)
+            rest += each.adj.get_references()[2]
+    return found
+
+
+def _may_end_without_result(func: Any) -> bool:
+    """Return whether a Warp function returns a value on some paths but not on all; on the others Warp returns zeros."""
+
+    def returns(statements: list[ast.stmt]) -> bool:
+        return any(
+            isinstance(each, ast.Return) or (isinstance(each, ast.If) and returns(each.body) and returns(each.orelse))
+            for each in statements
+        )
+
+    tree = func.adj.tree
+    has_value = any(isinstance(node, ast.Return) and node.value is not None for node in ast.walk(tree))
+    return has_value and not returns(tree.body[0].body)
 
 
 def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
@@ -84,8 +115,11 @@ def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> N
 
 @functools.cache
 @locked
-def _returned(func: wp.Function, takes: tuple[Any, ...]) -> Any:
-    """Return the type that a Warp function returns for arguments of types `takes`, None without a `return`."""
+def _returned(func: wp.Function, takes: tuple[Any, ...], content: bytes) -> Any:
+    """Return the type that a Warp function returns for arguments of types `takes`, None without a `return`.
+
+    content: its `content_hash`, for the cache.
+    """
     overload: Any = func.get_overload(list(takes), {})
     if overload is None:
         raise InputError(f"{place_of(func)}: {func.key} must take ({', '.join(map(shown_type, takes))})")

@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.tasks.terms import Term
-from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import locked
 
@@ -34,7 +33,7 @@ class TermSlot(SimpleNamespace):
         super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
         self.term, self.func = term, term.func
         self.parameterless = not term.num_params  # Warp refuses an empty `*p[start:start]`
-        self.start, self.stop = offset + len(settings), offset + len(numbers)
+        self.first, self.start, self.stop = offset, offset + len(settings), offset + len(numbers)
         """Half-open range of the function's parameters: `*p[slot.start : slot.stop]`."""
         self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
         """Parts of the term that are compiled into a kernel; tasks with equal tuples share the kernel."""
@@ -58,6 +57,12 @@ class TaskParams:
                     self.names.setdefault(f"{section}.{term.name}.{key}", len(self.values))
                     self.values.append(float(value))
 
+    def checked(self, numbers: Sequence[float], i: int) -> float:
+        """Return number `i` of a list like `values` as its term stores it. Raises InputError: it is out of bounds."""
+        slot = next(slot for slots in self.slots.values() for slot in slots if slot.first <= i < slot.stop)
+        term = slot.term.with_flat_numbers(numbers[slot.first : slot.stop])
+        return list(term.flat_numbers.values())[i - slot.first]
+
     def index(self, name: str) -> int:
         """Return the index of a term's parameter by its dotted name. Raises InputError: there is none."""
         if name not in self.names:
@@ -74,6 +79,7 @@ class ParamArrays:
     def __init__(self, params: TaskParams, device: Any) -> None:
         """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""
         self.params = params
+        self._numbers = list(params.values)  # `values` before their conversion to float32
         self.values = wp.array(params.values, dtype=float, device=device)
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
         """Numbers changed by `set`, (len(values),); infinity elsewhere."""
@@ -82,14 +88,17 @@ class ParamArrays:
     def set(self, name: str, value: float) -> None:
         """Change a term's parameter, given by its dotted name, on the device.
 
-        Raises InputError: there is none, or it is not finite in float32.
+        Raises InputError: there is none, or the term refuses the value in a configuration too.
         """
-        check_finite(name, value)
         i = self.params.index(name)
+        value = self._numbers[i] = self.params.checked([*self._numbers[:i], value, *self._numbers[i + 1 :]], i)
         for array in (self.values, self.changed):
             array[i : i + 1].fill_(value)
 
     def restore(self) -> None:
         """Reset all parameters to `params.values` except those that `set` changed. Waits for the device."""
         changed = self.changed.numpy()
-        self.values.assign(np.where(np.isinf(changed), np.array(self.params.values, dtype=np.float32), changed))
+        decimals = [float(str(value)) for value in changed]  # such as 0.1 for the float32 0.100000001
+        pairs = zip(self.params.values, decimals, strict=True)
+        self._numbers = [value if math.isinf(change) else change for value, change in pairs]
+        self.values.assign(np.array(self._numbers, dtype=np.float32))

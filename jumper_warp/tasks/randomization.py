@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, Literal
 
 from jumper_warp.kernels.mdp import parameters
-from jumper_warp.robot.description import load_description
-from jumper_warp.robot.overlay import RANDOMIZED
+from jumper_warp.tasks.bounds import check_range
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_bounds, check_probabilities
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.checks import check_probabilities
 
 Range = tuple[float, float] | None  # (lower, upper), or None: off
 NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not randomised
@@ -22,24 +19,6 @@ LONGEST_LATENCY = 100.0
 """[ms] Longest latency that the ring buffers of targets and observations hold: 48 physics steps, six policy steps."""
 PUSH_INTERVAL = (0.2, 0.5)  # [s] Time from one sample of the push to the next (authors' configuration)
 PUSH_PROBABILITY = 0.25  # [1] Probability of a push in such an interval (authors' configuration)
-
-
-@cache
-def _base_mass() -> float:
-    """Return the mass of the base link in the robot description [kg]."""
-    return load_description().links[0].mass
-
-
-def _least(name: str) -> tuple[float, bool]:
-    """Return the smallest value that a randomisation range may contain, in its unit, and whether it is itself excluded.
-
-    name: the range's field in `RandomizationCfg`.
-    """
-    if name == "base_mass":
-        return -_base_mass(), True
-    if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
-        return 0.0, True
-    return -math.inf, False
 
 
 @dataclass(frozen=True)
@@ -96,15 +75,8 @@ class RandomizationCfg:
     def __post_init__(self) -> None:
         """Raise InputError if a range is reversed, not finite or out of bounds, or a probability is not in 0 to 1."""
         for name, value in vars(self).items():
-            if not isinstance(value, tuple):
-                continue
-            check_bounds("randomisation range", self, {name: RANDOMIZED[name]})
-            if not value[0] <= value[1]:
-                raise InputError(f"randomisation range {name} must rise, got {value}")
-            least, exclusive = _least(name)
-            if value[0] < least or (exclusive and value[0] == least):
-                bound = f"be above {least:g}" if exclusive else "not be negative"
-                raise InputError(f"randomisation range {name} must {bound}, got {value}")
+            if isinstance(value, tuple):
+                check_range(name, value)
         check_probabilities("randomisation", self, "push_probability", "zero_latency_probability")
 
     @classmethod

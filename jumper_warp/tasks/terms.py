@@ -7,7 +7,7 @@ numbers of a task lie in one array on the device, so that each can change while 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, get_type_hints
 
@@ -21,8 +21,10 @@ from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
+from jumper_warp.tasks.bounds import check_event_ranges, checked_number
 from jumper_warp.tasks.copying import Copyable
-from jumper_warp.tasks.functions import check_function, place_of, shown_type
+from jumper_warp.tasks.functions import check_function, is_own, place_of, shown_type
+from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -31,7 +33,6 @@ OBSERVATION_BOUNDS = {
     "noise": (0.0, 1.0e3), "noise_limit": (1.0e-3, 10.0), "scale": (1.0e-6, 1.0e6), "clip": (1.0e-6, 1.0e6)
 }  # fmt: skip
 """Smallest and largest settings of an observation term; noise and clip in the unit of the function."""
-LARGEST = 1.0e9  # Largest absolute value of a term's number
 MAX_HISTORY = 1000  # Largest number of frames of an observation term
 
 
@@ -55,7 +56,8 @@ class Term(Copyable):
         """Create a term from a function; values: its parameters (numbers and options) by name.
 
         func: @wp.func with the class's signature. name: for logs and flags (default: the function's name).
-        Raises InputError: a number is missing, unknown or not finite, or the function does not fit the class.
+        Raises InputError: a number is missing, unknown or out of bounds (see `checked_number`), or the function does
+        not fit the class.
         """
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
@@ -77,15 +79,18 @@ class Term(Copyable):
             if key not in known and key not in self.options:
                 raise InputError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
         self.numbers = {key: values.get(key, default) for key, default in known.items()}
+        divides = "weight" in self.settings and not is_own(func)
         for key, value in self.numbers.items():
             if value is REQUIRED:
                 raise InputError(f"{where}: parameter {key!r} is missing")
-            parts = value if isinstance(known[key], tuple) and isinstance(value, tuple) else (value,)
-            wrong = any(isinstance(part, bool) or not isinstance(part, int | float) for part in parts)
-            if wrong or not all(abs(part) <= LARGEST for part in parts):
-                limit = f"within {LARGEST:g}, got {value!r:.60}"
-                raise InputError(f"{where}: parameter {key!r} must be a finite number {limit}")
+            if isinstance(known[key], tuple) and isinstance(value, tuple):
+                self.numbers[key] = tuple(checked_number(where, key, part) for part in value)
+            else:
+                self.numbers[key] = checked_number(where, key, value, divides)
         self.options = {key: values.get(key, default) for key, default in type(self).options.items()}
+        for key in (key for key, default in type(self).options.items() if isinstance(default, bool)):
+            check_flags(**{f"{where}: {key}": self.options[key]})
+            self.options[key] = bool(self.options[key])
         self.num_params = len(params)
 
     def _check_types(self, where: str) -> None:
@@ -139,6 +144,13 @@ class Term(Copyable):
             pair = isinstance(value, tuple)
             flat |= {f"{key}.lower": value[0], f"{key}.upper": value[1]} if pair else {key: value}
         return flat
+
+    def with_flat_numbers(self, flat: Iterable[float]) -> Any:
+        """Return a copy of the term with new numbers, in the order of `flat_numbers`; errors: as `replace`."""
+        rest = iter(flat)
+        parts = {key: tuple(next(rest) for _ in value) if isinstance(value, tuple) else next(rest)
+                 for key, value in self.numbers.items()}  # fmt: skip
+        return self.replace(**parts)
 
     def arguments(self) -> dict[str, Any]:
         """Return the constructor's arguments that make an equal term."""
@@ -207,9 +219,8 @@ class ObservationTerm(Term):
         if "return" not in get_type_hints(self.func.func):
             where = f"{place_of(self.func)}: ObservationTerm {self.name}"
             raise InputError(f"{where}: the function needs an annotation of its return type, {self.returned}")
-        history = self.options["history"]
-        if not isinstance(history, int) or not 1 <= history <= MAX_HISTORY:
-            raise InputError(f"ObservationTerm {self.name}: history must be in 1 to {MAX_HISTORY}, got {history!r:.40}")
+        history = check_count(f"ObservationTerm {self.name}: history", self.options["history"], MAX_HISTORY)
+        self.options = {**self.options, "history": history}
         for key, (low, high) in OBSERVATION_BOUNDS.items():
             if not low <= self.numbers[key] <= high:
                 limits = f"{low:g} to {high:g}, got {self.numbers[key]:.6g}"
@@ -277,6 +288,7 @@ class EventTerm(Term):
         rises = isinstance(interval, tuple) and len(interval) == 2 and 0.0 <= interval[0] <= interval[1]
         if not rises or (mode == "interval" and interval[0] == 0.0):
             raise InputError(f"EventTerm {self.name}: interval_range_s must be (lower, upper) above 0, got {interval}")
+        check_event_ranges(self.func, self.numbers)
 
     def due_at(self, stage: int) -> bool:
         """Return whether the event may run at a stage of `kernels.mdp.events`: STARTUP, AT_RESET or AT_STEP."""
@@ -316,8 +328,10 @@ class Curriculum(Term):
         super().__init__(func, **values)
         if not isinstance(self.options["counts"], wp.Function):
             raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (state) -> bool")
-        if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
-            raise InputError(f"Curriculum {self.name}: tolerance must not be negative, promote_after at least 1")
+        promote_after = self.numbers["promote_after"]
+        if self.numbers["tolerance"] < 0.0 or promote_after < 1 or promote_after % 1:
+            limits = "tolerance must not be negative, promote_after at least 1 and a whole number"
+            raise InputError(f"Curriculum {self.name}: {limits}")
 
 
 @dataclass(frozen=True)

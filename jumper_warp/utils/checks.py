@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import operator
 import re
 from collections.abc import Mapping
 from numbers import Integral, Real
@@ -71,10 +72,31 @@ def check_probabilities(section: str, cfg: Any, *names: str) -> None:
             raise InputError(f"{section} {name} must be in [0, 1], got {value}")
 
 
-def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> None:
-    """Raise InputError unless the value is an integer from 1 to `most`, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= most:
+def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> int:
+    """Return an integer, such as `np.int64(4)`, as int.
+
+    Raises InputError: it is a bool, no integer, or not in 1 to `most`.
+    """
+    try:
+        number = 0 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = 0
+    if not 1 <= number <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
+    return number
+
+
+def check_flags(**flags: Any) -> None:
+    """Raise InputError unless all values are bools of Python or NumPy: the text "no" is true; flags: values by name."""
+    for name, value in flags.items():
+        if not isinstance(value, bool) and getattr(getattr(value, "dtype", None), "kind", "") != "b":
+            raise InputError(f"{name} must be True or False, got {value!r:.40}")
+
+
+def check_flag_fields(cfg: Any) -> None:
+    """Raise InputError unless all fields of a dataclass whose default is a bool have one; see `check_flags`."""
+    names = [spec.name for spec in dataclasses.fields(cfg) if isinstance(spec.default, bool)]
+    check_flags(**{name: getattr(cfg, name) for name in names})
 
 
 def check_types(section: str, cfg: Any) -> None:
@@ -140,10 +162,18 @@ def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float
                 raise InputError(f"{section} {name} must be in {limits}, got {number!s:.40}")
 
 
-def check_seed(value: Any) -> None:
-    """Raise InputError unless the value is an integer from 0 to MOST_SEED, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) <= MOST_SEED:
+def check_seed(value: Any) -> int:
+    """Return an integer, such as `np.int64(4)`, as int.
+
+    Raises InputError: it is a bool, no integer, or not in 0 to MOST_SEED.
+    """
+    try:
+        number = -1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = -1
+    if not 0 <= number <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
+    return number
 
 
 def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from warp._src.context import ModuleHasher  # what Warp itself compares to find a changed kernel
 
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.threads import available_threads
@@ -24,6 +25,21 @@ else:
 def records(structs: wp.array) -> NDArray[np.void]:
     """Copy a Warp array of structs to a structured NumPy array with the same fields; waits for the device."""
     return cast("NDArray[np.void]", structs.numpy())
+
+
+def content_hash(*parts: Any) -> bytes:
+    """Return a hash of the code of all Warp functions in nested tuples, with functions and constants that they use.
+
+    A function has the same identity after a notebook's cell has defined a helper or a constant of it again.
+    """
+    hasher, hashes, rest = ModuleHasher([], {}), [], list(parts)
+    while rest:
+        part = rest.pop()
+        if isinstance(part, tuple):
+            rest += part
+        elif isinstance(part, wp.Function):
+            hashes.append(hasher.hash_function(part))
+    return b"".join(hashes)
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:

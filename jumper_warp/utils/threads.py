@@ -10,6 +10,7 @@ from queue import SimpleQueue
 from threading import RLock, Thread
 from typing import Any, ParamSpec, TypeVar
 
+from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 
 MAX_THREADS = 1024  # Largest number of threads of a simulation
@@ -100,9 +101,7 @@ def checked_threads(threads: int | None) -> int:
     """
     if threads is None:
         return available_threads() if _default_threads is None else _default_threads
-    if isinstance(threads, bool) or not isinstance(threads, int) or not 1 <= threads <= MAX_THREADS:
-        raise InputError(f"threads must be a whole number of 1 to {MAX_THREADS}, got {threads!s:.60}")
-    return threads
+    return check_count("threads", threads, MAX_THREADS)
 
 
 def set_threads(threads: int | None) -> None:

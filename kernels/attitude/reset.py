@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..mdp.attempts import sync_attempts
+from ..mdp.durations import whole_steps
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, fold_in, uniform_range
 from ..mdp.view import RobotArrays
@@ -29,5 +30,5 @@ def reset_attitude(
     quat = sample_unit_quat(fold_in(rng, streams.ORIENTATION_BRANCH))
     sync_attempts(rng)
     write_start(arrays, scene, skill, settings, quat, rng)
-    new.episode_steps = wp.max(int(uniform_range(rng, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
+    new.episode_steps = wp.max(whole_steps(uniform_range(rng, streams.EPISODE_STEPS, settings.episode_steps) + 0.5), 1)
     return with_goal(new, quat, quat * sample_rotation(fold_in(rng, streams.TURN_BRANCH), level))

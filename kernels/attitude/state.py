@@ -88,7 +88,8 @@ def carried_over(old: AttitudeState) -> AttitudeState:
     new.sum_collisions = old.sum_collisions
     if old.steps > 0 and old.episode_steps > 0 and old.steps >= old.episode_steps:
         new.episodes = old.episodes + 1.0
-        new.sum_error = old.sum_error + old.error
+        if wp.isfinite(old.error):
+            new.sum_error = old.sum_error + old.error
         new.sum_collisions = old.sum_collisions + float(old.collisions) / POLICY_RATE
         if old.inside > 0:
             new.settled = old.settled + 1.0

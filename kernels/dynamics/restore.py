@@ -52,10 +52,11 @@ def restore_motors_kernel(
     torque: wp.array2d(dtype=float),
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
+    peak_paw_force: wp.array2d(dtype=float),
 ):
     """Reset the motors of masked worlds: targets to standing angles [rad], torques and forces to 0; thread per world.
 
-    standing, target, filtered_target, torque: (12, num_worlds). paw_force: (4, num_worlds).
+    standing, target, filtered_target, torque: (12, num_worlds). paw_force, peak_paw_force: (4, num_worlds).
     """
     world = wp.tid()
     if not mask[world]:
@@ -66,6 +67,7 @@ def restore_motors_kernel(
         torque[motor, world] = 0.0
     for k in range(4):
         paw_force[k, world] = wp.vec3(0.0)
+        peak_paw_force[k, world] = 0.0
     peak_force[world] = 0.0
 
 

@@ -6,6 +6,7 @@ The deceleration along the base's present velocity is the paper's; the stock ter
 
 import warp as wp
 
+from ..mdp.durations import whole_steps
 from ..mdp.rewards import phi, posture_offset, psi
 from ..mdp.view import RobotView, angle_from_level
 from .phase import estimated_apex, landing_error_estimate
@@ -113,7 +114,7 @@ def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float
 @wp.func
 def predicted_height_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float) -> bool:
     """Terminate `steps` policy steps after takeoff if the ballistic apex is > `tolerance` [m] off the commanded one."""
-    if state.phase != FLIGHT or state.phase_steps != int(steps) or state.apex_passed != 0:
+    if state.phase != FLIGHT or state.phase_steps != whole_steps(steps) or state.apex_passed != 0:
         return False
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
     return wp.abs(apex - state.goal[2]) > tolerance

@@ -7,6 +7,7 @@ samples the state of the robot.
 import warp as wp
 
 from ..layout import DOFS
+from ..mdp.durations import whole_steps
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
@@ -84,7 +85,7 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) ->
 
     delay: range of the number; probability: of a further jump.
     """
-    steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
+    steps = whole_steps(uniform_range(rng, streams.AGAIN_STEP, delay))
     return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)
 
 
@@ -98,7 +99,7 @@ def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
     probability = ranges.long_wait_probability
     soon = (u - probability) / wp.max(1.0 - probability, 1.0e-6) * (float(ranges.command_delay) + 0.999)
     later = u / wp.max(probability, 1.0e-6) * (float(ranges.long_wait) + 0.999)
-    return int(wp.where(u < probability, later, soon))
+    return whole_steps(wp.where(u < probability, later, soon))
 
 
 @wp.func
@@ -241,7 +242,7 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
     new.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
     new.max_height = robot.pos[2]
-    new.command_step = int(values[3])
+    new.command_step = whole_steps(values[3])
     return new
 
 

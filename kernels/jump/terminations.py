@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..mdp.durations import whole_steps
 from ..mdp.view import RobotView, angle_from_level, base_deceleration, yaw_of
 from .phase import landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
@@ -10,7 +11,7 @@ from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
 @wp.func
 def landed_for(robot: RobotView, state: JumpState, steps: float) -> bool:
     """Terminate `steps` policy steps after touchdown: the jump is complete."""
-    return state.phase == LANDED and state.phase_steps >= int(steps)
+    return state.phase == LANDED and state.phase_steps >= whole_steps(steps)
 
 
 @wp.func
@@ -32,7 +33,7 @@ def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: 
     The ballistic landing is p_xy + t v_xy with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through
     h, `height` [m] above the goal's ground.
     """
-    if state.phase != FLIGHT or state.phase_steps != int(steps):
+    if state.phase != FLIGHT or state.phase_steps != whole_steps(steps):
         return False
     return landing_error_estimate(robot, state, height) > tolerance
 
@@ -91,7 +92,8 @@ def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float)
 
     It idles if the base rests for more than `idle_steps` policy steps.
     """
-    return waiting(state) and (state.steps - state.command_step > int(steps) or state.idle_steps > int(idle_steps))
+    late = state.steps - state.command_step > whole_steps(steps)
+    return waiting(state) and (late or state.idle_steps > whole_steps(idle_steps))
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .durations import whole_steps
 from .env import EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
@@ -19,7 +20,7 @@ def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> in
 
     The time until then is uniform from least to most [s]; step_dt [s]: policy step.
     """
-    return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
+    return wp.max(whole_steps(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
 
 def make_event_kernel(slots: list) -> wp.Kernel:

@@ -7,7 +7,7 @@ import warp as wp
 from ..actuation.command_filter import FilterParams
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.inverse import LegLimits
-from ..layout import COORDS, DOFS, motor_slot
+from ..layout import BODIES, COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
@@ -206,17 +206,17 @@ def clear_history_kernel(
     arrays: RobotArrays,
     delays: Delays,
 ):
-    """Clear the stored actions, torques and contacts of worlds with mask != 0; one thread per (motor, world).
+    """Clear the stored actions, torques, contacts and wrenches of worlds with mask != 0; a thread per (motor, world).
 
-    Present and past motor targets become the present motor angles; paw and base kinematics are updated. first: world of
-    the first thread.
+    Present and past motor targets become the present angles as the position sensors read them, so that motors at rest
+    have no torque; paw and base kinematics are updated. first: world of the first thread.
     """
     m, world = wp.tid()
     world += first
     if mask[world] == 0.0:
         return
     slot = motor_slot(m)
-    angle = arrays.joint_q[world * COORDS + 7 + slot]
+    angle = arrays.joint_q[world * COORDS + 7 + slot] + arrays.joint_offset[m, world]
     arrays.torque[m, world] = 0.0
     arrays.prev_torque[m, world] = 0.0
     arrays.action[m, world] = 0.0
@@ -227,6 +227,8 @@ def clear_history_kernel(
     arrays.prev_rate[m, world] = arrays.joint_qd[world * DOFS + 6 + slot]
     for i in range(RING):
         delays.target_history[i, m, world] = angle
+    delays.current_target[m, world] = angle
+    delays.prev_target[m, world] = angle
     if m < 4:
         arrays.impulse[m, world] = wp.vec3(0.0)
         arrays.paw_force[m, world] = wp.vec3(0.0)
@@ -239,4 +241,6 @@ def clear_history_kernel(
         update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
         arrays.diverged[world] = 0
+        arrays.body_f[world * BODIES] = wp.spatial_vector()
+        delays.switch_step[world] = 0
         arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

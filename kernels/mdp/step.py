@@ -96,7 +96,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
 
         One thread per world. p: numbers of the task's terms. The first termination that holds ends the episode.
         episode_sum: (rewards, num_worlds), sums of `term_value` since the episode, or this skill in it, began.
-        term_value: (rewards, num_worlds), rewards of this step, weights applied; non-finite ones add 0 to the reward.
+        term_value: (rewards, num_worlds), rewards of this step, weights applied; non-finite ones add 0 to all sums.
+        A reward of weight 0 is not evaluated.
         observed: observation terms before this step; found, found_states: see `record_non_finite`.
         """
         world = episode.first + wp.tid()
@@ -137,26 +138,26 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         total = float(0.0)
         finite = bool(True)
         for i in range(wp.static(len(rewards))):
-            if wp.static(rewards[i].parameterless):
-                raw = wp.static(rewards[i].func)(robot, state)
-            else:
-                raw = wp.static(rewards[i].func)(
-                    robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
-                )
-            value = p[wp.static(rewards[i].weight)] * raw
-            if wp.static(bool(rewards[i].scale_by_dt)):
-                value = value * arrays.step_dt
-            if diverged:
-                value = float(0.0)
+            weight = p[wp.static(rewards[i].weight)]
+            value = float(0.0)
+            if weight != 0.0 and not diverged:
+                if wp.static(rewards[i].parameterless):
+                    value = weight * wp.static(rewards[i].func)(robot, state)
+                else:
+                    value = weight * wp.static(rewards[i].func)(
+                        robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
+                    )
+                if wp.static(bool(rewards[i].scale_by_dt)):
+                    value = value * arrays.step_dt
             term_value[i, world] = value
+            if not wp.isfinite(value):
+                finite = False
+                value = float(0.0)
+            total += value
             running = wp.where(begun, value, episode_sum[i, world] + value)
             episode_sum[i, world] = wp.where(ended, 0.0, running)
             if ended:
                 counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(running)
-            if wp.isfinite(value):
-                total += value
-            else:
-                finite = False
         if not wp.isfinite(total):
             total = float(0.0)
         if wp.static(floor is not None):

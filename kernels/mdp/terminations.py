@@ -7,13 +7,14 @@ from typing import Any
 
 import warp as wp
 
+from .durations import whole_steps
 from .view import RobotView, has_diverged, tilt
 
 
 @wp.func
 def too_long(robot: RobotView, state: Any, steps: float) -> bool:
     """Terminate an episode after `steps` policy steps."""
-    return state.steps >= int(steps)
+    return state.steps >= whole_steps(steps)
 
 
 @wp.func

@@ -8,6 +8,7 @@ import warp as wp
 from ..attitude.state import AttitudeState, with_goal
 from ..jump.phase import time_to_height
 from ..jump.state import FLIGHT, LANDED, STANCE, JumpState
+from ..mdp.durations import NEVER
 from ..mdp.view import RobotView, tilt, yaw_of
 from ..velocity.state import VelocityState
 
@@ -25,7 +26,6 @@ NO_JUMP_STEPS = wp.constant(150)  # policy steps in stance after which walking t
 FREE_STEPS = wp.constant(2)  # policy steps after a takeoff from which on turning takes over
 LANDING_TIME = wp.constant(0.35)  # [s] the jump takes over this long before the base falls below LANDING_HEIGHT
 LANDING_HEIGHT = wp.constant(0.45)  # [m] of the base above the ground
-NEVER = wp.constant(1_000_000)  # `command_step` of a jump without a command
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..mdp.durations import whole_steps
 from ..mdp.env import Scene
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotView
@@ -99,7 +100,7 @@ def resample_velocity(
 ) -> VelocityState:
     """Return the state with a newly sampled command and its duration; robot and scene are unused."""
     new = with_command(state, sample_velocity_command(rng, level, state.command_level))
-    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
+    new.command_lasts = wp.max(whole_steps(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
     return new
 
 

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..mdp.attempts import sync_attempts
+from ..mdp.durations import whole_steps
 from ..mdp.env import Scene, SkillSettings
 from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.view import RobotArrays, base_pos
@@ -76,5 +77,5 @@ def reset_velocity(
     new.phase = uniform(rng, streams.GAIT_PHASE, 0.0, 1.0)
     new.limit = map_limit(settings.map)
     new = with_command(new, sample_velocity_command(rng, level, new.command_level))
-    new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
+    new.command_lasts = wp.max(whole_steps(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
     return new

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..mdp.durations import whole_steps
 from ..mdp.view import RobotView
 
 POLICY_RATE = wp.constant(60.0)  # policy steps in a second
@@ -87,7 +88,8 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
     error = velocity_error(robot, state)
     xy = wp.length(wp.vec2(error[0], error[1]))
     yaw = wp.abs(error[2])
-    if t.command_steps > int(settle) and xy < MAX_COUNTED_ERROR and yaw < MAX_COUNTED_ERROR:  # both false for NaN
+    finite = xy < MAX_COUNTED_ERROR and yaw < MAX_COUNTED_ERROR  # both false for NaN
+    if t.command_steps > whole_steps(settle) and finite:
         speed = wp.length(wp.vec2(state.command[0], state.command[1])) + 0.3 * wp.abs(state.command[2])
         t.error_xy = state.error_xy + xy
         t.error_yaw = state.error_yaw + yaw

@@ -60,6 +60,8 @@ def still(tmp_path_factory):
         ([*TRAIN, "--task", "other"], "give the task once"),
         ([*TRAIN, "--env.rewards.jump-height.weight", "nan"], "jump-height.weight must be a finite number"),
         (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
+        ([*TRAIN, "--env.terminations.too-long.steps", "-1"], "'steps' must be 0 or more, infinite for never"),
+        (["train", "velocity-flat", "--env.levels.0.resampling-time-range", "nan", "1"], "must be (lower, upper)"),
         (["list", "--task-module", "missing.py"], "missing.py: no such file (tasks of your own)"),
         (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
@@ -85,6 +87,11 @@ def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkey
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]
+
+
+def test_flag_of_a_duration_may_be_infinite_for_never(capsys):
+    flags = "--env.terminations.too-long.steps inf --init-policy /none --num-envs 2 --device cpu"
+    assert run(capsys, "train", "vertical-jump", *flags.split())[2][-1] == "jumper: /none: no such folder (policy)"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from cli_helpers import run
+from jumper_warp.envs import term_check
 from jumper_warp.envs.env import Env
 
 
@@ -23,6 +24,13 @@ def test_prints_versions_and_a_step_on_each_device(capsys):
     rows = dict(line.split(None, 1) for line in out.splitlines())
     assert code == 0 and rows["torch"] == torch.__version__ and rows["newton"] and rows["rerun-sdk"]
     assert all("built and stepped 64 worlds" in rows[str(device)] for device in wp.get_devices())
+
+
+def test_terms_of_a_task_that_fail_are_named_and_the_exit_code_is_1(capsys, monkeypatch):
+    found = {"reset": "", "rewards.mine": "killed by SIGABRT"}
+    monkeypatch.setattr(term_check, "check_terms", lambda task: found.items() if task.name == "attitude" else ())
+    code, out, err = run(capsys, "doctor", "--task", "attitude")
+    assert (code, out.splitlines(), err) == (1, ["reset: ok", "rewards.mine: killed by SIGABRT"], [])
 
 
 def test_device_that_fails_is_reported_and_the_exit_code_is_1(capsys, monkeypatch):

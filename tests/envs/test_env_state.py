@@ -107,8 +107,9 @@ def test_an_environment_continues_bitwise_from_a_saved_state(solver):
     saved, fresh = (make_env(count, seed=1, solver=solver, **ALL_ON) for _ in range(2))
     for action in random_actions(count, 5):
         saved.step(action)
-    edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5)
-    saved.metrics()
+    edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5, phase=2, phase_steps=58)
+    for action in random_actions(count, 2):
+        saved.step(action)  # some episodes end, so that counters are not 0
     fresh.load_state_dict(saved.state_dict())
     assert len(list(assert_equal_steps(saved, fresh))) == 25
     assert fresh.metrics() == saved.metrics()
@@ -155,6 +156,8 @@ def test_a_saved_state_does_not_change_with_the_environment():
         ({"num_envs": 4}, "saved with num_envs 2, this environment has 4"),
         ({"seed": 9}, "saved with seed 1, this environment has seed 9"),
         ({"randomize": False}, "saved with other randomisation or events of vertical-jump"),
+        ({"noise": True}, "saved with noise False, this environment has noise True"),
+        ({"refine": 2}, "saved with substeps 8, this environment has substeps 16"),
         ({"task": dataclasses.replace(make_task("vertical-jump"), motors=jumping_motors(12.0))}, "with other robots"),
     ],
 )
@@ -167,6 +170,18 @@ def test_refuses_a_state_of_another_environment_without_changes(change, message)
         env.load_state_dict(state)
     assert "\n" not in str(caught.value)
     assert equal(env.state_dict(), before)
+
+
+def test_a_state_of_an_earlier_version_is_restored_without_counters_and_options():
+    saved, fresh = (make_env(4, seed=1) for _ in range(2))
+    edit_episodes(fresh, phase=2, phase_steps=59)
+    fresh.step(torch.zeros((4, 12)))
+    assert fresh.skills[0].counters.termination_count.numpy().sum() == 4
+    state = saved.state_dict()
+    new = [name for name in state if "/counters." in name or name.startswith("condition.")]
+    assert len(new) == 9
+    fresh.load_state_dict({name: value for name, value in state.items() if name not in new})
+    assert equal(fresh.state_dict(), state)
 
 
 def test_every_randomised_parameter_is_restored_and_is_not_in_the_fingerprint():

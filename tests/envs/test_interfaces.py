@@ -261,7 +261,7 @@ def test_a_changed_parameter_of_a_term_acts_in_captured_steps():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
+        ("rewards.orientation.weight", NAN, "'weight' must be a finite number within 1e\\+09, got nan"),
         ("rewards.orientation.depth", 1.0, "no number 'depth' of a rewards term 'orientation'"),
         ("weight", 1.0, "names are like rewards.jump_height.weight"),
     ],

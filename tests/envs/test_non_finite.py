@@ -92,6 +92,38 @@ def test_state_and_action_that_are_not_finite_are_reported_but_fast_motion_is_no
     assert (found.term, found.world) == ("terminations.diverged", 4)
 
 
+def test_a_value_that_is_not_finite_counts_as_0_in_the_metrics(env):
+    env.reset()
+    env.metrics()
+    lift(env, 5)
+    env.step(REST)
+    edit_episodes(env, steps=10**6)  # all episodes end as too long
+    env.step(REST)
+    assert env.done.all()
+    metrics = env.metrics()
+    mean_height = metrics["Episode_Reward/below"]  # of 47 worlds
+    assert all(map(math.isfinite, metrics.values())) and mean_height > 0.0
+
+
+def test_a_reward_of_weight_0_is_not_evaluated():
+    task = make_task("vertical-jump")
+    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(below, 0.0)))
+    env = make_env(N, task=task, reset=only("default"))
+    lift(env, 5)
+    env.step(REST)
+    assert env.non_finite() == []
+    assert not env.reward_terms["below"].any()
+
+
+def test_a_metric_of_the_state_counts_a_value_that_is_not_finite_as_0():
+    env = make_env(N, task=make_task("attitude"))
+    states = env.skills[0].states.numpy().copy()
+    states["sum_error"], states["episodes"] = 0.25, 1.0
+    states["sum_error"][3] = math.nan
+    env.skills[0].states.assign(states)
+    assert env.metrics()["Metrics/error_at_end_rad"] == pytest.approx(0.25 * (N - 1) / N)
+
+
 def test_dump_is_read_and_played(tmp_path, capsys):
     env = make_env(N, task=faulty_task(), reset=only("default"))
     lift(env, 7)

@@ -25,6 +25,7 @@ from jumper_warp.sim.slices import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
+from mdp_helpers import write
 from skill_helpers import begin_hold, begin_jump, jump_requested
 
 N = 3 * MIN_WORLDS + 2
@@ -52,7 +53,8 @@ def run(threads, steps=240, task=JUMP, **arguments):
     env = Env(task, N, seed=3, device="cpu", threads=threads, **arguments)
     assert len(env.sim.slices) == threads
     for skill in env.skills:
-        skill.set("curriculum", skill.task.curriculum.name, promote_after=0.0)  # every counted episode promotes
+        number = skill.task.params.index(f"curriculum.{skill.task.curriculum.name}.promote_after")
+        write(skill.params.values, number, 0.0)  # every counted episode promotes
     env.reset()
     found = []
     for step, action in enumerate(random_actions(N, steps)):

@@ -43,7 +43,8 @@ def snapshot(sim):
     n = sim.num_worlds
     state = [getattr(sim.state, name).numpy().reshape(n, -1) for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
     results = [np.moveaxis(getattr(sim, name).numpy(), 0 if name == "peak_force" else 1, 0) for name in RESULTS]
-    return [values.reshape(n, -1).copy() for values in [*state, *results, sim.target.numpy().T]]
+    results += [sim.target.numpy().T, sim.physics.peak_paw_force.numpy().T]
+    return [values.reshape(n, -1).copy() for values in [*state, *results]]
 
 
 def break_world(sim, world):
@@ -229,3 +230,25 @@ def test_motors_commanded_beyond_a_squat_give_way_until_virtual_work_balances():
     # 0.175 cos(t) + sqrt(0.3^2 - (0.045 + 0.175 sin(t))^2) below the hips, virtual work balances at t = 1.232 rad,
     # ankle 0.272 m and paw 0.297 m below. (A little less is borne by the motors: shanks and paws rest on the ground.)
     assert sim.joint_q()[0, 2] == pytest.approx(0.297, abs=0.02)
+
+
+def test_distances_far_from_the_origin_have_the_documented_errors():
+    """Weightless robots move for 10 s; docs/explanation/reproducibility.md has a table of the errors."""
+    expected = {
+        (0.01, 10.0): 0.007,
+        (0.1, 10.0): -0.002,
+        (0.1, 1.0e3): -0.12,
+        (1.0, 1.0e3): -0.004,
+        (0.01, 1.0e3): -1.0,
+    }
+    speed, start = np.array(list(expected)).T
+    sim = Simulation(len(expected), gravity=0.0, visuals=False, device="cpu")
+    q, qd = (array.numpy().reshape(len(expected), -1).copy() for array in (sim.state.joint_q, sim.state.joint_qd))
+    q[:, POS], qd[:, LIN_VEL] = np.stack([start, 0.0 * start, 2.0 + 0.0 * start], 1), np.outer(speed, [1.0, 0.0, 0.0])
+    sim.state.joint_q.assign(q.ravel())
+    sim.state.joint_qd.assign(qd.ravel())
+    for _ in range(600):
+        sim.step()
+    covered = sim.joint_q()[:, 0] - start
+    np.testing.assert_allclose(covered / (10.0 * speed) - 1.0, list(expected.values()), atol=0.005)
+    np.testing.assert_allclose(sim.joint_qd()[:, 0], speed, rtol=1e-5)

@@ -55,6 +55,9 @@ def test_unknown_field_is_refused_with_its_place_and_similar_fields(right, wrong
          "own_faults.py:99: give_hold must take (RobotView, Scene, HoldState, a vector of 4, float32)"),
         ("mdp.rewards.psi(robot", "mdp.rewards.psy(robot", "own_faults.py:141, function near_goal: Could not find"),
         (STEPS, "", "own_faults.py:16: the state HoldState of hold-height needs a field steps: int"),
+        *((STEPS, f"{STEPS}    {name}: float\n", f"own_faults.py:16: field {name!r}: `Env.task_arrays` has")
+           for name in ("level", "done", "termination", "base_pos", "base_vel", "base_quat")),
+        ("        return level", "        pass", "values of HoldLevelCfg must return HoldLevel, it returns NoneType"),
         ("    struct = HoldLevel\n", "", "levels[0]: HoldLevelCfg must have the attributes struct and values()"),
         ("(10.0, 40.0)", "15.0", "hold-height: action_scale must be (float, float), got 15.0"),
     ],

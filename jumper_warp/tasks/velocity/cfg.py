@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
+from jumper_warp.kernels.mdp.durations import NEVER
 from jumper_warp.kernels.velocity.commands import CommandRanges, resample_due, resample_velocity, set_velocity
 from jumper_warp.kernels.velocity.start_states import TileMap, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.cfg import Command, TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_bounds, check_probabilities
+from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class CommandCfg:
     turn_in_place_probability: float = 0.05
     """[1] Probability of a command to turn on the spot."""
     resampling_time_range: Pair = (2.0, 6.0)
-    """[s] Time from one command to the next."""
+    """[s] Time from one command to the next; infinity: one command for the whole episode."""
     smallest: float = 0.0
     """[m/s], [rad/s] Least magnitude of each sampled component of a command other than to stand."""
 
@@ -76,15 +76,15 @@ class CommandCfg:
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
         if not 0.0 <= self.smallest <= min(self.first_range):
             raise InputError(f"the smallest command must be in 0 to {min(self.first_range)}, got {self.smallest}")
-        if self.levels < 0:
-            raise InputError(f"command levels must not be negative, got {self.levels}")
+        check_bounds("command", self, {"levels": (0, MOST_SETTING, "")})
         kinds = ("standing_probability", "turn_in_place_probability")
         check_probabilities("command", self, "first_range_probability", *kinds)
         if self.standing_probability + self.turn_in_place_probability > 1.0:
             raise InputError(f"command {' and '.join(kinds)} must add up to at most 1")
         low, high = self.resampling_time_range
-        if not 0.0 < low <= high < math.inf:
-            raise InputError(f"resampling_time_range must be (lower, upper), positive and finite, got ({low}, {high})")
+        if not 0.0 < low <= high:
+            raise InputError(f"resampling_time_range must be (lower, upper), positive, got ({low}, {high})")
+        object.__setattr__(self, "resampling_time_range", (min(low, float(NEVER)), min(high, float(NEVER))))
 
     def values(self) -> Any:
         """Return the ranges of commands as a kernel struct, `CommandRanges`, with times in policy steps of 1/60 s."""

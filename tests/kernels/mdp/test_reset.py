@@ -274,7 +274,7 @@ def test_clear_history_changes_only_its_arrays_and_only_masked_worlds(stage):
 
 
 ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
-        "contact_time", "air_time", "touchdown_speed", "paw_height", "diverged", "collisions")  # fmt: skip
+        "contact_time", "air_time", "touchdown_speed", "paw_height", "diverged", "collisions", "body_f")  # fmt: skip
 CLEARED = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
@@ -282,11 +282,12 @@ def test_clear_history_sets_arrays_to_0_or_the_present_state(stage):
     stage.scramble()
     stage.clear_history(MASK)
     robot = values_of(stage.robot, RobotArrays)
+    robot.body_f = robot.body_f.reshape(N, -1, 6)[:, 0]  # the base
     for name in ZERO:
         assert not by_world(getattr(robot, name))[MASK].any(), name
         assert by_world(getattr(robot, name))[~MASK].all(), name
     q, qd = robot.joint_q.reshape(N, 43), robot.joint_qd.reshape(N, 38)
-    angles = q[:, MOTOR_COORDS][MASK]
+    angles = q[:, MOTOR_COORDS][MASK] + robot.joint_offset.T[MASK]
     for name in ("target", "filtered_target"):
         np.testing.assert_array_equal(by_world(getattr(robot, name))[MASK], angles, name)
     np.testing.assert_array_equal(by_world(robot.prev_rate)[MASK], qd[:, MOTOR_DOFS][MASK])

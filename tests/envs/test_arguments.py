@@ -1,0 +1,70 @@
+"""Arguments of other types: integers of NumPy and torch are counts, and texts are no flags."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import jumper_warp.gym  # registers the tasks
+from hold_height import hold_height, near_goal
+from jumper_warp.envs.env import Env
+from jumper_warp.envs.gymnasium import GymVectorEnv
+from jumper_warp.policies.conditions import Conditions
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
+from jumper_warp.utils.errors import InputError
+
+
+def test_integers_of_numpy_and_torch_are_counts():
+    env = Env(hold_height(), np.int64(4), seed=np.uint8(3), threads=np.int32(1), refine=torch.tensor(1), device="cpu")
+    env.reset(seed=np.int64(3))
+    obs = env.step(torch.zeros(4, 12)).obs["actor"].clone()
+    json.dumps(env.config())
+    other = Env(hold_height(), 4, seed=3, device="cpu")
+    other.reset()
+    assert torch.equal(other.step(torch.zeros(4, 12)).obs["actor"], obs)
+    envs = gymnasium.make_vec(jumper_warp.gym.env_id("vertical-jump"), np.int64(2), device="cpu")
+    assert envs.reset()[0].shape[0] == 2
+    Simulation(np.int64(2), substeps=np.int64(4), visuals=False, device="cpu").step()
+    assert type(TrainCfg("vertical-jump", num_envs=np.int64(8)).num_envs) is int
+
+
+@pytest.mark.parametrize("count", [True, 4.0, "4", np.float64(4.0), np.bool_(True), None])
+def test_refuses_a_count_that_is_no_integer(count):
+    with pytest.raises(InputError, match="num_envs must be a whole number"):
+        Env(hold_height(), count, device="cpu")
+
+
+@pytest.mark.parametrize("flag", ["no", "", 0, 1.0, None])
+@pytest.mark.parametrize("name", ["randomize", "noise", "auto_reset", "visuals"])
+def test_refuses_a_flag_that_is_no_bool(name, flag):
+    with pytest.raises(InputError, match=f"{name} must be True or False"):
+        Env(hold_height(), 2, device="cpu", **{name: flag})
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda flag: Simulation(2, device="cpu", keep_momentum=flag), "keep_momentum"),
+        (lambda flag: Simulation(2, device="cpu", observe_forces=flag), "observe_forces"),
+        (lambda flag: GymVectorEnv(Env(hold_height(), 2, device="cpu"), tensors=flag), "tensors"),
+        (lambda flag: GymVectorEnv(Env(hold_height(), 2, device="cpu"), all_groups=flag), "all_groups"),
+        (lambda flag: RewardTerm(near_goal, 1.0, width=1.0, scale_by_dt=flag), "RewardTerm near_goal: scale_by_dt"),
+        (lambda flag: TrainCfg("vertical-jump", stop_on_nan=flag), "stop_on_nan"),
+        (lambda flag: PpoCfg(graphs=flag), "graphs"),
+        (lambda flag: Conditions(randomize=flag), "randomize"),
+        (lambda flag: hold_height().terminations[0].replace(success=flag), "success"),
+        (lambda flag: hold_height().terminations[0].replace(time_out=flag), "time_out"),
+    ],
+)
+def test_refuses_a_text_as_a_flag(make, name):
+    with pytest.raises(InputError, match=f"{name} must be True or False, got 'no'"):
+        make("no")
+
+
+def test_a_bool_of_numpy_is_a_flag():
+    assert Env(hold_height(), 2, device="cpu", randomize=np.bool_(False)).config()["randomize"] is False
+    assert TerminationTerm(hold_height().terminations[0].func, success=np.bool_(True)).options["success"] is True
