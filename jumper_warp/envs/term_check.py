@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing import get_context
 from signal import Signals
+from typing import Any
 
 from jumper_warp.kernels.mdp.options import FAST
 from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
