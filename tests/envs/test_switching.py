@@ -119,9 +119,9 @@ def test_jumps_are_commanded_squat_time_after_the_handover_and_walking_starts_st
 
 
 def test_refuses_policies_of_other_tasks():
-    with pytest.raises(PolicyError, match=r"suite velocity, got one of task vertical-jump"):
+    with pytest.raises(PolicyError, match="a task with a VelocityEvaluation, got one of vertical-jump"):
         SkillPolicies(SkillNames(walk="vertical_jump"))
-    with pytest.raises(PolicyError, match=r"suite landing_position or omnidirectional, got one of task velocity-flat"):
+    with pytest.raises(PolicyError, match="a task with a PlaceEvaluation, got one of velocity-flat"):
         SkillPolicies(SkillNames(jump_to="walking_flat"))
 
 
