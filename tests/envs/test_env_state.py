@@ -24,12 +24,16 @@ ALL_ON = {"randomize": True, "noise": True}
 
 
 class Recorded(Env):
-    """Environment that stores the rewards of all steps."""
+    """Environment that stores the rewards of all steps and the last metrics."""
 
     def step(self, action):
         result = super().step(action)
         self.rewards = [*getattr(self, "rewards", []), self.reward.clone()]
         return result
+
+    def metrics(self):
+        self.logged = super().metrics()
+        return self.logged
 
 
 def train_jump(cfg):
@@ -64,6 +68,7 @@ def test_a_resumed_training_continues_bitwise(cfg):
     np.testing.assert_array_equal(resumed.sim.joint_q(), whole.sim.joint_q())
     np.testing.assert_array_equal(resumed.sim.joint_qd(), whole.sim.joint_qd())
     assert torch.equal(resumed.obs, whole.obs)
+    assert resumed.logged == whole.logged and whole.logged["Episode_Reward/action_rate"] < 0.0
     for part in ("ppo", "env", "rng"):
         assert equal(found[part], expected[part]), part
 
