@@ -284,9 +284,12 @@ def test_loading_restores_changed_parameters_and_resets_the_others_to_the_task()
     for key, value in (("weight", 7.0), ("std_fine", 0.2)):
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
-    state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="changed contains NaN"):
-        other.load_state_dict(state)
+    before, clip = other.state_dict(), other.skills[0].task.params.index("observations.actor.gravity.clip")
+    for index, number, message in ((clip, -5.0, "clip must be in"), (0, np.nan, "changed contains NaN")):
+        state["vertical-jump/changed"][index] = number
+        with pytest.raises(ValueError, match=message):
+            other.load_state_dict(state)
+        assert equal(other.state_dict(), before)
 
 
 def test_a_state_saved_without_a_reset_starts_like_a_new_environment():
