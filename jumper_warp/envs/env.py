@@ -182,14 +182,6 @@ class Env(Stages):
         self._clear_results(mask)
         return self._step.obs, {}
 
-    def _clear_results(self, mask: wp.array) -> None:
-        """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""
-        begun, episodes = wp.to_torch(mask) != 0.0, self.episodes
-        for name in ("reward", "done", "timeout", "terminated", "truncated", "termination"):
-            wp.to_torch(getattr(episodes, name)).masked_fill_(begun, -1 if name == "termination" else 0)
-        for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):
-            wp.to_torch(array).masked_fill_(begun, 0.0)
-
     @locked
     def use_reset_mask(self) -> torch.Tensor:
         """Make `step` reset worlds of a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.

@@ -256,6 +256,14 @@ class Stages(Uncopied):
         self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
 
+    def _clear_results(self, mask: wp.array) -> None:
+        """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""
+        begun, episodes = wp.to_torch(mask) != 0.0, self.episodes
+        for name in ("reward", "done", "timeout", "terminated", "truncated", "termination"):
+            wp.to_torch(getattr(episodes, name)).masked_fill_(begun, -1 if name == "termination" else 0)
+        for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):
+            wp.to_torch(array).masked_fill_(begun, 0.0)
+
     def _advance_rng(self, mask: wp.array) -> None:
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 

@@ -82,6 +82,8 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
         check_tensor(state[field], torch.from_numpy(saved[prefix][name].copy()), f"saved {field}")
+    for skill in env.skills:
+        skill.params.restored(state[f"{skill.task.name}/changed"].numpy())
     for name, own in conditions.items():
         check_tensor(state[name], own, f"saved {name}")
         if not torch.equal(state[name], own):

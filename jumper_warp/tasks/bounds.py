@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from functools import cache
-from numbers import Real
 from typing import Any
+
+import numpy as np
 
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.kernels.mdp.durations import NEVER
@@ -55,7 +56,7 @@ def checked_number(where: str, key: str, value: Any, divides: bool = False) -> f
         low, high, words = 0.0, 1.0, "in 0 to 1"
     elif WIDTH.fullmatch(key) or (divides and DIVISOR.fullmatch(key)):
         low, words = SMALLEST_WIDTH, f"a width of {SMALLEST_WIDTH:g} to {LARGEST:g}"
-    if isinstance(value, bool) or not isinstance(value, Real) or not low <= float(value) <= high:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low <= value <= high:
         raise InputError(f"{where}: parameter {key!r} must be {words}, got {value!r:.60}")
     value = value if isinstance(value, int) else float(value)
     return min(value, float(NEVER)) if DURATION.fullmatch(key) else value

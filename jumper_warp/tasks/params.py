@@ -97,8 +97,14 @@ class ParamArrays:
 
     def restore(self) -> None:
         """Reset all parameters to `params.values` except those that `set` changed. Waits for the device."""
-        changed = self.changed.numpy()
+        self._numbers = self.restored(self.changed.numpy())
+        self.values.assign(np.array(self._numbers, dtype=np.float32))
+
+    def restored(self, changed: np.ndarray) -> list[float]:
+        """Return all parameters, with those of `changed` that are finite. Raises InputError: a term refuses one."""
         decimals = [float(str(value)) for value in changed]  # such as 0.1 for the float32 0.100000001
         pairs = zip(self.params.values, decimals, strict=True)
-        self._numbers = [value if math.isinf(change) else change for value, change in pairs]
-        self.values.assign(np.array(self._numbers, dtype=np.float32))
+        numbers = [value if math.isinf(change) else change for value, change in pairs]
+        for slot in (slot for slots in self.params.slots.values() for slot in slots):
+            slot.term.with_flat_numbers(numbers[slot.first : slot.stop])
+        return numbers

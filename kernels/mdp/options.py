@@ -2,7 +2,7 @@
 
 from typing import Any
 
-FAST = {"enable_backward": False, "fast_math": True}
+FAST: dict[str, Any] = {"enable_backward": False, "fast_math": True}
 """Warp module options; fast_math: GPU divisions, roots, exponentials are exact to 2 units in the last place."""
 
 _definitions: dict[str, list] = {}  # structs by their key, in the order of their definitions

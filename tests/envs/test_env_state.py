@@ -24,12 +24,16 @@ ALL_ON = {"randomize": True, "noise": True}
 
 
 class Recorded(Env):
-    """Environment that stores the rewards of all steps."""
+    """Environment that stores the rewards of all steps and the last metrics."""
 
     def step(self, action):
         result = super().step(action)
         self.rewards = [*getattr(self, "rewards", []), self.reward.clone()]
         return result
+
+    def metrics(self):
+        self.logged = super().metrics()
+        return self.logged
 
 
 def train_jump(cfg):
@@ -64,6 +68,7 @@ def test_a_resumed_training_continues_bitwise(cfg):
     np.testing.assert_array_equal(resumed.sim.joint_q(), whole.sim.joint_q())
     np.testing.assert_array_equal(resumed.sim.joint_qd(), whole.sim.joint_qd())
     assert torch.equal(resumed.obs, whole.obs)
+    assert resumed.logged == whole.logged and whole.logged["Episode_Reward/action_rate"] < 0.0
     for part in ("ppo", "env", "rng"):
         assert equal(found[part], expected[part]), part
 
@@ -238,9 +243,12 @@ def test_loading_restores_changed_parameters_and_resets_the_others_to_the_task()
     for key, value in (("weight", 7.0), ("std_fine", 0.2)):
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
-    state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="changed contains NaN"):
-        other.load_state_dict(state)
+    before, clip = other.state_dict(), other.skills[0].task.params.index("observations.actor.gravity.clip")
+    for index, number, message in ((clip, -5.0, "clip must be in"), (0, np.nan, "changed contains NaN")):
+        state["vertical-jump/changed"][index] = number
+        with pytest.raises(ValueError, match=message):
+            other.load_state_dict(state)
+        assert equal(other.state_dict(), before)
 
 
 def test_a_state_saved_without_a_reset_starts_like_a_new_environment():
