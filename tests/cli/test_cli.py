@@ -627,6 +627,14 @@ def test_viewer_binds_to_loopback(tmp_path):
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
+def test_viewer_runs_no_code_of_the_working_directory(tmp_path):
+    (tmp_path / "rerun.py").write_text("raise SystemExit('code of the working directory')\n")
+    command = viewer_command(tmp_path / "jump.rrd")
+    version = [*command[: command.index("rerun") + 1], "--version"]
+    done = subprocess.run(version, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "rerun" in done.stdout and "working directory" not in done.stderr
+
+
 @pytest.mark.parametrize(
     "args",
     [
