@@ -95,7 +95,7 @@ def run_test(policy: str, name: str, out: Path, flags: list[str]) -> None:
     Raises subprocess.CalledProcessError: the command failed; its errors are on standard error.
     """
     program, *args = shlex.split(TESTS[name]["command"].format(policy=policy))
-    start = ["-m", "jumper_warp"] if program == "jumper" else [program]
+    start = ["-P", "-m", "jumper_warp"] if program == "jumper" else [program]
     command = [sys.executable, *start, *args, *flags, "--out", str(out)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 

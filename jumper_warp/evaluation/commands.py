@@ -294,5 +294,8 @@ def open_viewer(path: Path, viewer: str) -> None:
 
 
 def viewer_command(path: Path) -> list[str]:
-    """Return the command that opens a recording in the Rerun viewer, listening on loopback only."""
-    return [sys.executable, "-m", "rerun", str(path), "--bind", "127.0.0.1"]
+    """Return the command that opens a recording in the Rerun viewer, listening on loopback only.
+
+    Python must not import a `rerun.py` of the working directory (-P).
+    """
+    return [sys.executable, "-P", "-m", "rerun", str(path), "--bind", "127.0.0.1"]

@@ -15,7 +15,7 @@ from jumper_warp.cli import main as cli
 from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import parse_settings, parse_train
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.commands import PlayCfg
+from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.runs import load_policy, open_policy
@@ -392,6 +392,19 @@ def test_refuses_to_save_metrics_of_another_stream_than_reporting(trained_run, c
     args = [str(trained_run / "policy"), "--save-to-policy", "--stream", "selection", "--device", "cpu"]
     code, _, err = run(capsys, "evaluate", *args)
     assert code == 2 and err[-1].endswith("save_to_policy is for the stream reporting, got selection")
+
+
+def test_viewer_binds_to_loopback(tmp_path):
+    command = viewer_command(tmp_path / "jump.rrd")
+    assert command[-2:] == ["--bind", "127.0.0.1"]
+
+
+def test_viewer_runs_no_code_of_the_working_directory(tmp_path):
+    (tmp_path / "rerun.py").write_text("raise SystemExit('code of the working directory')\n")
+    command = viewer_command(tmp_path / "jump.rrd")
+    version = [*command[: command.index("rerun") + 1], "--version"]
+    done = subprocess.run(version, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and "rerun" in done.stdout and "working directory" not in done.stderr
 
 
 def redirected(redirection, *args, **environment):

@@ -145,7 +145,7 @@ def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr(measure_policies.subprocess, "run", lambda command, **_: calls.append(command))
     run_test("slippery_jump", "side_friction_0.4", tmp_path, ["--seed", "1"])
-    assert calls[0][1:5] == ["-m", "jumper_warp", "evaluate", "slippery_jump"]
+    assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "slippery_jump"]
     assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
     assert all((POLICIES.parents[1] / test["command"].split()[0]).is_file() or test["command"].startswith("jumper ")
                for test in TESTS.values())  # fmt: skip
