@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 from dataclasses import asdict, dataclass, replace
@@ -24,6 +25,7 @@ from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.plots import figure
 from support.departures import Ablation
 from support.squats import SquatLog, squat_goals, squat_metrics
@@ -120,8 +122,9 @@ def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
     table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
-    with (folder / "departures.txt").open("w") as file:
-        Console(file=file, width=WIDTH).print(table)
+    text = io.StringIO()
+    Console(file=text, width=WIDTH).print(table)
+    write_atomically(folder / "departures.txt", text.getvalue().encode())
     plot_results(results, folder / "departures.png")
 
 

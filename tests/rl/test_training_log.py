@@ -2,11 +2,11 @@ import contextlib
 import dataclasses
 import errno
 import json
-import resource
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from full_disk import full_disk
 from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
@@ -20,17 +20,6 @@ METRICS = {"Perf/total_fps": 1234.0, "Perf/elapsed_s": 5.0, "Metrics/success": 0
 def cfg(tmp_path):
     """Settings of 6 iterations of 16 steps, all logged; every second one is saved."""
     return push_cfg(tmp_path / "logs", max_iterations=6, log_interval=1)
-
-
-@contextlib.contextmanager
-def full_disk(size=0):
-    """Context in which this process cannot write files beyond `size` bytes: writes fail partway."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def iterations(path):
