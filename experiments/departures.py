@@ -16,6 +16,7 @@ continues. `--no-measure` only trains.
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +41,7 @@ from jumper_warp.rl.run_names import newest
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
@@ -267,8 +269,9 @@ def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
     table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
-    with (folder / "departures.txt").open("w") as file:
-        Console(file=file, width=WIDTH).print(table)
+    text = io.StringIO()
+    Console(file=text, width=WIDTH).print(table)
+    write_atomically(folder / "departures.txt", text.getvalue().encode())
     plot_results(results, folder / "departures.png")
 
 

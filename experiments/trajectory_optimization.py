@@ -52,6 +52,7 @@ from jumper_warp.trajectory import jumps
 from jumper_warp.trajectory.augmented_lagrangian import Progress, minimise
 from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
+from jumper_warp.utils.arrays import write_npz
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
@@ -461,7 +462,7 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, last, **settings)
     x = best[name] = progress.x[progress.best]
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()
-    np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
+    write_npz(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
     values = steps | {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
     replay = jump.replay(targets, args.device)
     return values | {"value": jump.value(replay), "violation": replay.violation}, replay

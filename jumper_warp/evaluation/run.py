@@ -27,6 +27,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.jump.evaluation import PlaceEvaluation
 from jumper_warp.tasks.overlay_ranges import range_words
+from jumper_warp.utils.arrays import write_npz
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import Report, output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -300,7 +301,7 @@ def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:
         name: np.array([np.nan if value is None else value for value in values])
         for name, values in log.columns().items()
     }
-    np.savez_compressed(folder / ("trials.npz" if number == 1 else f"trials_{number}.npz"), **columns)
+    write_npz(folder / ("trials.npz" if number == 1 else f"trials_{number}.npz"), **columns)
 
 
 def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:

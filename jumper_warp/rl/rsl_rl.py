@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from rsl_rl.env import VecEnv as RslRlEnv
 from rsl_rl.runners import OnPolicyRunner
 
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.utils.files import write_atomically
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
@@ -49,6 +53,13 @@ class _EndOfTraining(Exception):
     """Signal that leaves rsl-rl's training loop."""
 
 
+def _save(runner: OnPolicyRunner, path: str, infos: dict | None = None) -> None:
+    """Write a checkpoint of rsl-rl's runner as `OnPolicyRunner.save`, but atomically. Raises OSError with the path."""
+    buffer = io.BytesIO()
+    torch.save({**runner.alg.save(), "iter": runner.current_learning_iteration, "infos": infos}, buffer)
+    write_atomically(Path(path), buffer.getvalue())
+
+
 def train_rsl_rl(
     env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None,
     end_in: Callable[[int], Path | None] | None = None,
@@ -62,7 +73,7 @@ def train_rsl_rl(
     config = rsl_rl_config(cfg, save_interval, seed)
     runner = OnPolicyRunner(env, config, log_dir=folder and str(folder), device=str(env.device))
     logger: Any = runner.logger
-    log = logger.log
+    log, runner.save = logger.log, partial(_save, runner)  # pyright: ignore[reportAttributeAccessIssue]
 
     def log_and_check(**values: Any) -> None:
         """Log an iteration; save a checkpoint and raise _EndOfTraining if the training is over."""

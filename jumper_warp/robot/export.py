@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Literal
 
@@ -42,7 +41,7 @@ def export_robot(
     meshes = folder / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
     for file in mesh_files(robot):
-        shutil.copyfile(file, meshes / file.name)
+        write_atomically(meshes / file.name, file.read_bytes())
     if kind == "mjcf":
         path, text = folder / "jumper.xml", mjcf(description, values)
     else:

@@ -11,6 +11,7 @@ import numpy as np
 from jumper_warp.robot.model import standing_configuration
 from jumper_warp.robot.parts import MOTOR_JOINTS, Joint, Link, Loop, Motor, RobotDescription, Shape
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.rotations import from_rotation_vector, multiply, rotate
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -28,7 +29,7 @@ def write_usd(path: Path, robot: RobotDescription, paw_friction: float) -> Path:
         raise InputError('USD needs the package usd-core: pip install "jumper-warp[usd]"') from None
     UsdStage(stage, robot).write(paw_friction)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(stage.GetRootLayer().ExportToString(), encoding="utf-8")
+    write_atomically(path, stage.GetRootLayer().ExportToString().encode())
     return path
 
 

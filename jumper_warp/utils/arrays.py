@@ -1,15 +1,16 @@
-"""Reading of NumPy archives (.npz) of limited size."""
+"""Atomic writing of NumPy archives (.npz), and reading of those of limited size."""
 
 from __future__ import annotations
 
 import io
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file
+from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file, write_atomically
 
 
 def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[str, np.ndarray]:
@@ -32,3 +33,10 @@ def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[st
         raise
     except Exception as problem:  # zip and header errors are of many kinds
         raise error(f"{path}: not an npz file of plain arrays ({type(problem).__name__})") from None
+
+
+def write_npz(path: Path, **arrays: Any) -> None:
+    """Write arrays by name to a compressed npz file, atomically. Raises OSError as `write_atomically`."""
+    data = io.BytesIO()
+    np.savez_compressed(data, **arrays)
+    write_atomically(path, data.getvalue())

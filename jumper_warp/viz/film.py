@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
@@ -66,10 +68,13 @@ def write_film(
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
+    images = _images(recording, times, size, eye, ranks, path.name)
+    if path.suffix != ".mp4":
+        write_atomically(path, _encoded_animation(images, path.suffix[1:], fps, len(times)))
+        return path
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    encode = _encode_mp4 if path.suffix == ".mp4" else _encode_animation
     try:
-        encode(temporary, _images(recording, times, size, eye, ranks, path.name), size, fps, len(times))
+        _encode_mp4(temporary, path, images, size, fps)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -184,8 +189,10 @@ def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
     return "   ".join(filter(None, [recording.heading(ranks), f"{time:.2f} s"]))
 
 
-def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
-    """Write images as H.264 in yuv420p, which browsers and slides play. Raises OSError: ffmpeg fails."""
+def _encode_mp4(
+    path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float
+) -> None:  # fmt: skip
+    """Write images as H.264 in yuv420p, for browsers and slides. Raises OSError, about `target`: ffmpeg fails."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-"]
@@ -199,14 +206,15 @@ def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]
         message = ffmpeg.communicate()[1].decode(errors="replace")
     if ffmpeg.returncode:
         reason = f"ffmpeg failed with status {ffmpeg.returncode}: {' '.join(message.split())[-300:]}"
-        raise OSError(errno.EIO, reason, str(path))
+        raise OSError(errno.EIO, reason, str(target))
 
 
-def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
-    """Write images as a repeating animation, WebP or GIF by the path's suffix."""
-    pictures = list(images)
-    tick = 10 if path.suffix == ".gif" else 1  # [ms] unit of the durations in the file
+def _encoded_animation(images: Iterator[Image.Image], kind: str, fps: float, count: int) -> bytes:
+    """Return `count` images as the content of a file with a repeating animation; kind: webp or gif."""
+    pictures, data = list(images), io.BytesIO()
+    tick = 10 if kind == "gif" else 1  # [ms] unit of the durations in the file
     ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)
     durations = np.diff(ends).tolist()  # [ms]
-    options: dict[str, Any] = {"quality": 75, "method": 4} if path.suffix == ".webp" else {"optimize": True}
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)
+    options: dict[str, Any] = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
+    pictures[0].save(data, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)
+    return data.getvalue()

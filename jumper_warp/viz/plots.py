@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.metrics import rate
 from jumper_warp.viz.style import ACTUAL_COLOR, GOAL_COLOR
 
@@ -43,8 +45,10 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
         if entries:
             columns = int(fig.get_figwidth() / (0.55 + 0.076 * max(map(len, entries))))
             fig.legend(entries.values(), entries.keys(), loc="outside lower left", ncols=max(columns, 1))
-        fig.savefig(path)
+        data = io.BytesIO()
+        fig.savefig(data, format=Path(path).suffix[1:])
         plt.close(fig)
+        write_atomically(Path(path), data.getvalue())
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ Entities, where <world> is the label of a world, or `world_<i>` if two worlds ha
 No viewer is started and no port is opened.
 """
 
-import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.shapes import ShapeMesh
@@ -49,23 +49,19 @@ LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
 def write_rrd(recording: "Recording", path: Path) -> Path:
     """Write a recording atomically as a Rerun file (.rrd); return the path.
 
+    Rerun collects it in memory: on a full disk its own writer would wait for ever.
     Raises ImportError: rerun-sdk is not installed; OSError.
     """
     rr = _import_rerun()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     stream = rr.RecordingStream("jumper-warp")
-    writer = _Writer(rr, stream, recording)
-    try:
-        stream.save(temporary, default_blueprint=_blueprint(recording))
-        writer.log_scene()
-        for rank in range(len(recording.worlds)):
-            writer.log_world(rank)
-        writer.log_series()
-        writer.log_states()
-        stream.disconnect()  # closes the file
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    memory, writer = stream.memory_recording(), _Writer(rr, stream, recording)
+    stream.send_blueprint(_blueprint(recording), make_active=False, make_default=True)
+    writer.log_scene()
+    for rank in range(len(recording.worlds)):
+        writer.log_world(rank)
+    writer.log_series()
+    writer.log_states()
+    write_atomically(path, memory.drain_as_bytes())
     return path
 
 

@@ -1,0 +1,71 @@
+"""Files on a full disk: no writer leaves a part of a file, waits for ever, or names another file than its own."""
+
+import io
+from contextlib import redirect_stdout
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from box_robot import box_recording, walk
+from full_disk import full_disk
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.evaluation.run import write_trials
+from jumper_warp.rl.rsl_rl import train_rsl_rl
+from jumper_warp.robot.export import export_robot
+from jumper_warp.viz.film import write_film
+from jumper_warp.viz.plots import figure
+from jumper_warp.viz.rerun import write_rrd
+from toy_task import SMALL, PushTask
+
+
+def film(path):
+    """Write a small film of a box to a path."""
+    write_film(box_recording(walk(1.0, seconds=0.2)), path, size=(96, 64))
+
+
+def plot(path):
+    """Write an empty plot to a path."""
+    with figure(path):
+        pass
+
+
+def trials(path):
+    """Write the trials of a log to the path of trials.npz."""
+    numbers = np.random.default_rng(0).normal(size=1000).tolist()
+    write_trials(path.parent, SimpleNamespace(columns=lambda: {"apex_m": numbers}), 1)
+
+
+def rsl_rl_checkpoint(path):
+    """Train for an iteration with rsl-rl, which writes a checkpoint to the path of model_0.pt."""
+    torch.manual_seed(0)
+    env = PushTask(8)
+    env.reset()
+    with redirect_stdout(io.StringIO()):  # not to a file, which would be full
+        train_rsl_rl(RslRlVecEnv(env, SMALL.num_steps), SMALL, 1, 1, 0, end_in=lambda iteration: path.parent)
+
+
+WRITERS = {
+    "box.rrd": lambda path: write_rrd(box_recording(walk(1.0)), path), "box.gif": film, "box.webp": film,
+    "box.mp4": film, "plot.png": plot, "trials.npz": trials, "model_0.pt": rsl_rl_checkpoint,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_full_disk_is_an_error_about_the_file_and_leaves_nothing(tmp_path, name):
+    folder = tmp_path / "full"
+    folder.mkdir()
+    with full_disk(300), pytest.raises(OSError) as caught:  # byte
+        WRITERS[name](folder / name)
+    assert caught.value.filename == str(folder / name) and not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["mjcf", "urdf", "usd"])
+def test_full_disk_while_the_robot_is_exported_names_the_new_file(tmp_path, kind):
+    if kind == "usd":
+        pytest.importorskip("pxr")
+    with full_disk(300), pytest.raises(OSError) as caught:  # byte
+        export_robot(kind, tmp_path)
+    assert caught.value.filename.startswith(str(tmp_path)) and caught.value.filename.endswith((".obj", ".usda"))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
