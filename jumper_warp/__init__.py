@@ -11,21 +11,25 @@ from jumper_warp.utils.version import __version__ as __version__
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env as Env
     from jumper_warp.policies.runs import load_policy as load_policy
+    from jumper_warp.recipe import Recipe as Recipe
     from jumper_warp.registry import make_task as make_task
     from jumper_warp.robot.model import build_model as build_model
     from jumper_warp.sim.simulation import Simulation as Simulation
     from jumper_warp.sim.solver import SolverJumper as SolverJumper
+    from jumper_warp.training import train as train
 
 _MODULES = {
     "Env": "jumper_warp.envs.env",
+    "Recipe": "jumper_warp.recipe",
     "Simulation": "jumper_warp.sim.simulation",
     "SolverJumper": "jumper_warp.sim.solver",
     "build_model": "jumper_warp.robot.model",
     "load_policy": "jumper_warp.policies.runs",
     "make_task": "jumper_warp.registry",
+    "train": "jumper_warp.training",
 }
 """Module of each public name, imported at the name's first use."""
-__all__ = ["Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task"]
+__all__ = ["Env", "Recipe", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task", "train"]
 
 limit_spinning()
 
