@@ -1,4 +1,4 @@
-"""Set-up of all tests: one OpenMP thread, kernels compiled once before the workers start, and a shared fixture."""
+"""Set-up of all tests: one OpenMP thread, Hypothesis without deadlines, kernels compiled once, a shared fixture."""
 
 import os
 import subprocess
@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # workers share the cores; before
 import pytest
 import torch
 import warp as wp
+from hypothesis import HealthCheck, settings
 
 from ground_helpers import hardest
 from hold_height import hold_height
@@ -16,6 +17,8 @@ from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 
 wp.config.log_level = wp.LOG_WARNING
+settings.register_profile("tests", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("tests")  # a loaded machine is no failure
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
 """Tasks whose kernels many files use, in addition to `hold_height`."""
 MUJOCO_STEP = """
