@@ -138,8 +138,8 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
 
     def __post_init__(self) -> None:
-        if self.seconds is not None and not 0.1 <= self.seconds <= 600.0:
-            raise InputError(f"seconds must be in [0.1, 600], got {self.seconds}")
+        if self.seconds is not None and not 0.02 <= self.seconds <= 600.0:
+            raise InputError(f"seconds must be in [0.02, 600], got {self.seconds}")
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:

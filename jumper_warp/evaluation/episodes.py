@@ -198,7 +198,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
     check(count >= 1, f"num_episodes must be at least 1, got {count}")
     fits = len(command) <= MAX_COMMAND_SIZE and all(abs(value) <= FLOAT32_MAX for value in command)
     check(fits, f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
-    check(0.1 <= seconds <= MAX_SECONDS, f"seconds must be in [0.1, {MAX_SECONDS:g}], got {seconds}")
+    check(0.02 <= seconds <= MAX_SECONDS, f"seconds must be in [0.02, {MAX_SECONDS:g}], got {seconds}")
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:

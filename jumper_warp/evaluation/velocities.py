@@ -307,5 +307,5 @@ class VelocityPlayFlags:
 def check_velocity_settings(robots: int, seconds: float, *commands: float) -> None:
     """Raise InputError unless number of robots, time [s] and commanded velocities are within their limits."""
     check(1 <= robots <= MAX_ROBOTS, f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
-    check(0.1 <= seconds <= 600.0, f"seconds must be in [0.1, 600], got {seconds}")
+    check(0.02 <= seconds <= 600.0, f"seconds must be in [0.02, 600], got {seconds}")
     check(all(abs(value) <= 10.0 for value in commands), f"commands must be within 10 m/s or rad/s, got {commands}")

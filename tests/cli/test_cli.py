@@ -70,8 +70,8 @@ def still(tmp_path_factory):
         (["sysid", "fit", "motions.npz"], "motions.npz: no such file (recorded motions)"),
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
         (["finetune", "vertical_jump", "--out", "."], "a policy's folder needs a name, got ."),
-        (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.1, 600], got 0.001"),
-        (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.1, 600], got 0.006"),
+        (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.02, 600], got 0.001"),
+        (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.02, 600], got 0.006"),
         (
             ["evaluate", "horizontal_jump", "--suite", "grid", "--rows", "9999"],
             "columns, rows and num_jumps must be at",

@@ -78,7 +78,7 @@ def test_episode_metrics_match_hand_computed_values(episodes):
     [
         (lambda: EpisodeFlags(num_episodes=0), "num_episodes must be at least 1"),
         (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
-        (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \[0.1, 600\]"),
+        (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \[0.02, 600\]"),
     ],
 )
 def test_refuses_invalid_settings(make, message):

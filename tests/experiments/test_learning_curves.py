@@ -12,13 +12,21 @@ from support import learning
 from support.learning import LearningCurve, compare, train_and_evaluate
 
 
+class Clock:
+    """Clock that stands until it is advanced; replaces `time.perf_counter`."""
+
+    def __init__(self, monkeypatch):
+        self.now = 1000.0
+        monkeypatch.setattr(time, "perf_counter", lambda: self.now)
+
+
 class Trainer:
-    """Stub of a trainer whose iterations take 10 ms; records the progress (0 to 1) that is set."""
+    """Stub of a trainer whose iterations take 1/128 s of a clock; records the progress (0 to 1) that is set."""
 
     batch_size = 64
 
-    def __init__(self):
-        self.progress = []
+    def __init__(self, clock):
+        self.progress, self.clock = [], clock
 
     def compile(self):
         pass
@@ -27,7 +35,7 @@ class Trainer:
         self.progress.append(progress)
 
     def iterate(self):
-        time.sleep(0.01)
+        self.clock.now += 1.0 / 128.0
 
 
 @pytest.fixture
@@ -40,25 +48,24 @@ def env():
 
 
 def test_timed_training_sets_progress_from_0_to_1_without_evaluation_time(env, monkeypatch):
-    evaluated = []
+    evaluated, clock = [], Clock(monkeypatch)
 
     def evaluate(trainer, eval_env, limits):
         evaluated.append(limits)
-        time.sleep(0.05)
+        clock.now += 0.05
         return 0.5
 
     monkeypatch.setattr(learning, "success_rate", evaluate)
-    trainer = Trainer()
-    curve = train_and_evaluate(env, trainer, None, 0.3, 0.1, (0.5, 0.9))
-    assert trainer.progress == sorted(trainer.progress) and trainer.progress[0] < 0.02
-    assert 0.8 < trainer.progress[-1] < 1.0  # evaluations do not count: with them it would be beyond 1
-    assert curve.iterations == len(trainer.progress) and curve.steps[-1] == 64 * curve.iterations
-    assert len(curve.seconds) == len(curve.success) == len(evaluated) == 3 and evaluated[0] == (0.5, 0.9)
+    trainer = Trainer(clock)
+    curve = train_and_evaluate(env, trainer, None, 0.375, 0.125, (0.5, 0.9))
+    assert trainer.progress == [i / 48.0 for i in range(48)]  # evaluations do not count
+    assert curve.seconds == [0.125, 0.25, 0.375] and curve.steps == [64 * 16, 64 * 32, 64 * 48]
+    assert curve.iterations == 48 and curve.success == [0.5] * 3 and evaluated == [(0.5, 0.9)] * 3
 
 
 def test_training_of_a_number_of_iterations_is_evaluated_at_equal_steps(env, monkeypatch):
     monkeypatch.setattr(learning, "success_rate", lambda *_: 0.5)
-    trainer = Trainer()
+    trainer = Trainer(Clock(monkeypatch))
     curve = train_and_evaluate(env, trainer, None, 5, 2, by_iterations=True)
     assert trainer.progress == [0.0, 0.2, 0.4, 0.6, 0.8]
     assert (curve.iterations, curve.steps) == (5, [128, 256, 320])

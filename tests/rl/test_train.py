@@ -18,7 +18,6 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
-from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
@@ -55,33 +54,6 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     manifest = json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text())
     assert manifest.keys() == {"iteration_000002.pt", "iteration_000004.pt"}
     assert json.loads(final_state(result)["config"]) == settings
-
-
-def resume_after(cfg, seconds, limit):
-    """Resume a checkpoint of 2 iterations; return the `TrainingRun` and its result.
-
-    seconds: training time in the checkpoint [s]; limit: max_seconds [s].
-    """
-    half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
-    state = final_state(half)
-    assert 0.0 < state.pop("seconds") <= half.seconds
-    save_checkpoint(half.folder / CHECKPOINTS, {**state, "seconds": seconds})
-    cfg = dataclasses.replace(cfg, max_iterations=100_000, max_seconds=limit, resume=str(half.folder))
-    run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
-    with StopRequest() as stop:
-        return run, run.iterate(stop)
-
-
-def test_resumed_run_continues_the_training_time(cfg):
-    run, result = resume_after(cfg, 99.7, limit=100.0)
-    assert result.iteration > 2 and result.seconds < 5.0
-    assert final_state(result)["seconds"] >= result.metrics["Perf/elapsed_s"] >= 100.0
-    final_kl = cfg.ppo.final_desired_kl  # progress counts the saved time, and is near 1
-    assert run.ppo._desired_kl.item() == pytest.approx(final_kl, rel=0.05)
-
-
-def test_resumed_run_past_its_time_limit_ends_immediately(cfg):
-    assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
 
 
 def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):

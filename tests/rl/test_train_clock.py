@@ -4,8 +4,12 @@ import dataclasses
 import time
 
 import pytest
+import torch
 
-from jumper_warp.rl.runner import train
+from jumper_warp.rl.checkpoint import CheckpointError, save_checkpoint
+from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, train
+from jumper_warp.rl.stop_request import StopRequest
 from test_train import final_state
 from toy_task import SMALL, PushTask, push_cfg
 
@@ -46,6 +50,45 @@ def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch,
     longer = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
     resumed = train_clocked(monkeypatch, longer, [700.0] + [1.0] * 31)  # one warm-up iteration, and one of 16 s
     assert (resumed.iteration, final_state(resumed)["seconds"]) == (7, 80.0)
+
+
+def resume_clocked(monkeypatch, cfg, seconds, limit):
+    """Resume a checkpoint of 2 iterations, with 0.125 s for each further one; return the `TrainingRun` and its result.
+
+    seconds: training time in the checkpoint [s], None: missing. limit: max_seconds [s].
+    """
+    half = train(dataclasses.replace(cfg, max_iterations=2), PushTask)
+    state = final_state(half)
+    assert 0.0 < state.pop("seconds") <= half.seconds
+    save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
+    env = ClockedTask(cfg.num_envs, durations=[1.0 / 128.0] * 160)
+    monkeypatch.setattr(time, "perf_counter", lambda: env.now)
+    cfg = dataclasses.replace(cfg, max_seconds=limit, resume=str(half.folder))
+    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")))
+    with StopRequest() as stop:
+        return run, run.iterate(stop)
+
+
+def test_resumed_run_continues_the_training_time(cfg, monkeypatch):
+    run, result = resume_clocked(monkeypatch, cfg, 99.5, limit=100.0)
+    assert result.iteration == 2 + 5  # the first iteration does not count
+    assert final_state(result)["seconds"] == result.metrics["Perf/elapsed_s"] == 100.0
+    final_kl = cfg.ppo.final_desired_kl  # progress counts the saved time, and is near 1
+    assert run.ppo._desired_kl.item() == pytest.approx(final_kl, rel=0.05)
+
+
+def test_resumed_run_past_its_time_limit_ends_immediately(cfg, monkeypatch):
+    assert resume_clocked(monkeypatch, cfg, 100.0, limit=100.0)[1].iteration == 2
+
+
+def test_resume_without_saved_time_counts_from_zero(cfg, monkeypatch):
+    result = resume_clocked(monkeypatch, cfg, None, limit=0.25)[1]
+    assert (result.iteration, final_state(result)["seconds"]) == (2 + 3, 0.25)
+
+
+def test_refuses_a_checkpoint_with_a_malformed_time_in_one_line(cfg, monkeypatch):
+    with pytest.raises(CheckpointError, match=r"does not fit these settings: seconds must be .*'late'"):
+        resume_clocked(monkeypatch, cfg, "late", limit=100.0)
 
 
 @pytest.mark.parametrize(
