@@ -233,5 +233,5 @@ def test_public_names_are_imported_lazily():
         assert getattr(jumper_warp, name).__name__ == name
     assert jumper_warp.Env.__module__ == "jumper_warp.envs.env"
     assert sorted(jumper_warp.__all__) == [
-        "Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task",
+        "Env", "Recipe", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task", "train",
     ]  # fmt: skip

@@ -64,11 +64,11 @@ def test_resume_uses_the_settings_of_the_run(capsys, run, begun):
 
 
 def test_flags_override_saved_settings_and_print_each_change(capsys, run):
-    flags = ["--env.gravity", "9.81", "--env.rewards.base-at-rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
+    flags = ["--env.gravity", "9.81", "--env.rewards.base-at-rest.weight", "-0.25", "--ppo.gamma", "0.95"]
     flags += ["--env.reset.tilt", "2"]
     code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", *flags)
     assert code == 0 and changed_settings(err) == [
-        "max-iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
+        "max-iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "env.reset.tilt 5.0 -> 2.0",
         "env.rewards.base-at-rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
@@ -110,8 +110,13 @@ def test_settings_missing_from_the_run_have_defaults(capsys, run):
     resave(run, lacks=("noise", "randomize"))
     recipe, _ = parse_train(["vertical-jump", "--resume", str(run)])
     assert (recipe.noise, recipe.randomize, recipe.task.gravity) == (True, True, 3.71)
-    err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize")[2]
-    assert changed_settings(err) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
+    err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize", "--no-noise")[2]
+    assert changed_settings(err) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> False"]
+
+
+def test_refuses_other_noise_than_the_run_has_by_name(capsys, run):
+    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--noise")
+    assert code == 2 and "saved with noise False, this environment has noise True" in err[-1]
 
 
 def test_finished_run_names_the_flag_that_extends_it(capsys, run):

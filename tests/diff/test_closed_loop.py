@@ -28,7 +28,8 @@ def policy(name="vertical_jump"):
 def jumps():
     """Return a group of two nominal robots, commanded to jump to 0.85 and 0.95 m at once."""
     group = make_groups(
-        policy(), FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=0, height_range=(0.85, 0.95), device="cpu")
+        policy().recipe(),
+        FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=0, height_range=(0.85, 0.95), device="cpu"),
     )[0]
     group.commands[:, 3] = 0.0  # [s] time of the command
     return group

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from jumper_warp.tasks.commands import layout_of
-from support.soak import hardest
 
+from ground_helpers import hardest
 from jump_helpers import make_env, only, random_actions, resetting
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import TASKS, make_task
@@ -41,7 +40,7 @@ def test_a_used_environment_has_the_state_of_a_new_one_after_a_reset(name, solve
     for env in (used, new):
         env.metrics()
         env.episodes.step_count.fill_(100)
-        env.evaluation_reset([0.0, 0.0, 0.7] + [1.0] * (len(layout_of(task).values) - 3))
+        env.evaluation_reset([0.0, 0.0, 0.7] + [1.0] * (len(task.command.labels) - 3))
     assert not differences(used, new)
 
 

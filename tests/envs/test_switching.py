@@ -1,5 +1,7 @@
 """Handovers between the shipped policies on one robot: their order, and the state after them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -123,9 +125,10 @@ def trained_with():
 
     def load(*masses):
         policies = SkillPolicies()
-        for policy, mass in zip(policies.policies, masses, strict=True):
-            robot = {} if mass is None else {"robot": RobotOverlay({"base_mass": (mass,)}, source="bench").to_json()}
-            policy.config = {"env": {"task": policy.config["env"]["task"], **robot}}
+        robots = [None if mass is None else RobotOverlay({"base_mass": (mass,)}, source="bench") for mass in masses]
+        policies.recipes = [
+            replace(recipe, robot=robot) for recipe, robot in zip(policies.recipes, robots, strict=True)
+        ]
         return policies
 
     return load

@@ -1,17 +1,39 @@
 """Updates of a policy's folder that are interrupted, fail on a full disk, or run at the same time."""
 
 import errno
+import itertools
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from boundary import small_policy
+import torch
 
+from jumper_warp.deploy.policy import JOINTS
 from jumper_warp.policies.folder import add_files, read_policy, save_policy
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.spec import PolicyInterface
+from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.utils.files import write_atomically
 
 OLD = {"metrics.json": b"{}", "run.json": b"{}"}
 NEW = {"metrics.json": b'{"new": 1}', "run.json": b'{"new": 2}', "plot.txt": b"new"}
+
+
+def small_policy(num_obs=24):
+    """Return a policy for 12 motors that observes angles and rates, with random weights."""
+    torch.manual_seed(2)
+    term = {"scale": 1.0, "clip": 100.0, "history": 1}
+    interface = PolicyInterface.from_json({
+        "task": "vertical-jump", "observation_names": [f"obs_{i}" for i in range(num_obs)], "joint_names": list(JOINTS),
+        "action_scale": [0.3] * 12, "default_joint_pos": [0.1] * 12, "joint_stiffness": [17.0] * 12,
+        "joint_damping": [1.8] * 12, "torque_limit": [18.0] * 12, "policy_dt": 1.0 / 60.0, "physics_dt": 1.0 / 480.0,
+        "command_filter": json.loads(json.dumps(vars(vertical_jump_filter()), default=vars)), "hidden": [6, 4],
+        "activation": "elu", "observation_limit": 100.0, "normalised_limit": 10.0, "quaternion_order": "xyzw",
+        "observation_layout": {"angle": term | {"first": 0, "end": 12}, "rate": term | {"first": 12, "end": 24}},
+    })  # fmt: skip
+    layers = [(torch.randn(o, i), torch.randn(o)) for i, o in itertools.pairwise((num_obs, 6, 4, 12))]
+    return Policy(layers, torch.randn(num_obs), torch.rand(num_obs) + 0.1, interface, {"env": {"seed": 5}})
 
 
 class RenameFault:
