@@ -22,6 +22,7 @@ from jumper_warp.envs.arrays import (
 )
 from jumper_warp.envs.stages import Stages, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
+from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
@@ -214,6 +215,8 @@ class Env(Stages):
         self.episodes.skill.assign(self._first_skill)
         for skill in self.skills:
             skill.states.zero_()
+            for name in Counters.vars:
+                getattr(skill.counters, name).zero_()
 
     def step(self, action: torch.Tensor) -> Step:
         """Advance one policy step; the next step overwrites the returned tensors, so clone those you need later.
