@@ -110,7 +110,10 @@ class DeployedPolicy:
         """
         try:
             with np.errstate(over="ignore"):
-                value = np.atleast_1d(np.asarray(reading, dtype=np.float32))
+                value = np.atleast_1d(np.asarray(reading))
+                if np.iscomplexobj(value):
+                    raise TypeError("complex numbers")
+                value = value.astype(np.float32)
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"{name} must be numbers, got {reading!r:.60}") from None
         width = _width(self.layout[name])
@@ -241,7 +244,12 @@ class JumpCommand:
     """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Start with no jump commanded; takeoff_speed: upward speed [m/s] that counts as takeoff."""
+        """Start with no jump commanded; takeoff_speed: upward speed [m/s] that counts as takeoff, above 0 to 20.
+
+        Raises InputError: it is out of range.
+        """
+        if not 0.0 < takeoff_speed <= 20.0:
+            raise InputError(f"takeoff_speed must be above 0 to 20 m/s, got {takeoff_speed!r:.40}")
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False
 

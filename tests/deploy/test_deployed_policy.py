@@ -263,6 +263,19 @@ def test_refuses_weights_in_another_file_than_the_checksum_covers(tmp_path, monk
         DeployedPolicy("policy.onnx")
 
 
+@pytest.mark.parametrize("speed", [math.nan, -1.0, 0.0, math.inf])
+def test_jump_command_refuses_a_takeoff_speed_that_no_robot_reaches(speed):
+    with pytest.raises(InputError, match="takeoff_speed must be above 0 to 20 m/s"):
+        JumpCommand(speed)
+
+
+def test_refuses_a_complex_reading():
+    policy = onnx_of("vertical_jump")
+    readings = zero_readings(policy)
+    with pytest.raises(InputError, match="angle must be numbers"):
+        policy.targets(readings | {"angle": readings["angle"] + 0.5j})
+
+
 @pytest.mark.parametrize("values", [(1.0e30, 4), (0.0, -1), (0.0, 5)])  # vertical velocity [m/s], paws down
 def test_jump_command_refuses_implausible_values(values):
     with pytest.raises(InputError, match="vertical_velocity must be within ±20 m/s and paws_down 0 to 4"):
