@@ -19,7 +19,7 @@ agree at the end of a step, whatever the block's mass.
 
 import warp as wp
 
-from ..scalar import mat33, real, vec3
+from ..scalar import mat33, real, vec2, vec3
 from .base_dynamics import BaseInverse, LegSolve
 from .inertia import skew
 from .leg_dynamics import PawKinematics
@@ -29,7 +29,8 @@ PUSH_OUT_SPEED = wp.constant(real(1.0))  # largest speed of that push [m/s]
 CONTACT_MARGIN = wp.constant(real(0.02))  # [m] a paw is solved for if its free motion leaves a smaller gap
 STIFF_BAND = wp.constant(real(2.0e-6))  # [m] gaps up to this size, + or -, stay unchanged if the leg is on a hard stop
 STICK_SPEED = wp.constant(real(0.01))  # [m/s] contacts slower than this start the step with static friction
-FRICTION_STEP = wp.constant(real(0.6))  # `scale` of `sliding_impulse` per sum of the two tangential responses
+SLIDE_TOLERANCE = wp.constant(real(1.0e-6))  # relative distance of a sliding paw's impulse from the friction cone
+MAX_SLIDE_STEPS = wp.constant(24)  # of `sliding_impulse`; few are needed
 
 SEPARATE = wp.constant(0)  # modes of a contact
 STICK = wp.constant(1)
@@ -116,36 +117,98 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
     return c
 
 
-@wp.func
-def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the next iterate of a sliding paw's impulse [N s]: a friction update, clamped to the friction cone.
+@wp.struct
+class SlidingPaw:
+    """Equation of a sliding paw's friction t [N s], along two axes of the surface: (M + s I) t = r.
 
-    The impulse satisfies the normal condition of the contact. impulse [N s], velocity [m/s]: current values at the paw.
-    The new friction is (current friction - slip / scale), cut off at the friction cone. The fixed point is the cone's
-    edge opposite to the slip; friction is never stretched to the cone, which would make friction along the slip a fixed
-    point too. The steps converge if scale exceeds half the largest tangential response, and fastest if it is half the
-    sum of both.
+    M is the response of the tangential velocity at constant normal velocity; s >= 0 is the slip per friction, since
+    the slip is -s t. The paw's load is p_n = size - tilt . t.
+    """
+
+    first: vec3  # axis of the surface, unit, body axes
+    second: vec3
+    trace: real  # of M [1/kg]
+    determinant: real  # of M [1/kg^2]
+    right: vec2  # r [m/s]
+    adjugate: vec2  # (trace I - M) r, so that t = (adjugate + s r) / det(M + s I)
+    size: real  # load without friction [N s]
+    tilt: vec2  # load that friction takes from the normal [1]
+
+
+@wp.func
+def sliding_paw(c: PawContact, free: vec3) -> SlidingPaw:
+    """Return the equation of a paw's friction while it slides.
+
+    free [m/s]: velocity of the contact point without an impulse on this paw, body axes.
     """
     n = c.normal
+    zero = real(0.0)
+    paw = SlidingPaw()
+    paw.first = wp.normalize(wp.where(wp.abs(n[0]) < real(0.7), vec3(zero, -n[2], n[1]), vec3(n[2], zero, -n[0])))
+    paw.second = wp.cross(n, paw.first)
     across = c.total * n
+    along_first = c.total * paw.first
     normal_response = wp.dot(n, across)
-    scale = FRICTION_STEP * ((c.total[0, 0] + c.total[1, 1] + c.total[2, 2]) - normal_response)
-    pull = impulse - velocity / scale
-    pull = pull - wp.dot(pull, n) * n
-    edge = n + c.mu * wp.normalize(pull)
-    response = wp.max(wp.dot(across, edge), real(0.1) * normal_response)
-    lack = c.goal - wp.dot(n, velocity) + wp.dot(across, impulse)
-    size = (lack - wp.dot(across, pull)) / normal_response
-    if size > real(0.0) and wp.dot(pull, pull) < c.mu * c.mu * size * size:
-        return size * n + pull
-    return wp.max(lack / response, real(0.0)) * edge
+    paw.tilt = vec2(wp.dot(across, paw.first), wp.dot(across, paw.second)) / normal_response
+    first_response = wp.dot(paw.first, along_first) - normal_response * paw.tilt[0] * paw.tilt[0]
+    second_response = wp.dot(paw.second, c.total * paw.second) - normal_response * paw.tilt[1] * paw.tilt[1]
+    cross_response = wp.dot(paw.second, along_first) - normal_response * paw.tilt[0] * paw.tilt[1]
+    paw.trace = first_response + second_response
+    paw.determinant = first_response * second_response - cross_response * cross_response
+    lack = c.goal - wp.dot(n, free)
+    paw.size = lack / normal_response
+    paw.right = -vec2(wp.dot(paw.first, free), wp.dot(paw.second, free)) - lack * paw.tilt
+    paw.adjugate = vec2(
+        second_response * paw.right[0] - cross_response * paw.right[1],
+        first_response * paw.right[1] - cross_response * paw.right[0],
+    )
+    return paw
+
+
+@wp.func
+def sliding_impulse(c: PawContact, free: vec3) -> vec3:
+    """Return the impulse [N s] of a paw that slides: on the edge of the friction cone, opposite to the slip.
+
+    free [m/s]: velocity of the contact point without an impulse on this paw, body axes; the paw neither separates nor
+    sticks. The ratio mu p_n / |t| is below 1 at s = 0 and grows without bound, so that some s is on the cone
+    (`SlidingPaw`). The ratio is linear in s if M is isotropic: Newton's method needs few steps; it is replaced by
+    bisection where it leaves the interval known to hold a solution.
+    """
+    paw = sliding_paw(c, free)
+    s = real(0.0)
+    low = real(0.0)
+    high = real(-1.0)  # none known
+    load = real(0.0)
+    along = vec2()
+    steps = int(0)
+    searching = bool(True)
+    while searching:
+        determinant = paw.determinant + s * (paw.trace + s)
+        along = paw.adjugate + s * paw.right  # t times the determinant
+        length = wp.length(along)
+        load = paw.size * determinant - wp.dot(paw.tilt, along)  # p_n times the determinant
+        excess = c.mu * load - length
+        rise = c.mu * (paw.size * (paw.trace + real(2.0) * s) - wp.dot(paw.tilt, paw.right))
+        slope = rise * length * length - c.mu * load * wp.dot(along, paw.right)  # of the ratio, times length^3
+        load /= determinant
+        steps += 1
+        searching = wp.abs(excess) > SLIDE_TOLERANCE * length and steps < MAX_SLIDE_STEPS
+        if excess < real(0.0):
+            low = s
+        else:
+            high = s
+        s -= excess * length * length / slope
+        if not (slope > real(0.0) and s > low and (high < real(0.0) or s < high)):
+            s = wp.where(high < real(0.0), real(2.0) * low + paw.trace, real(0.5) * (low + high))
+    along = wp.normalize(along)
+    return load * (c.normal + c.mu * (along[0] * paw.first + along[1] * paw.second))
 
 
 @wp.func
 def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     """Return the impulse [N s] that solves one paw's contact law while the impulses of the other paws are fixed.
 
-    impulse [N s] and velocity [m/s]: current values at this paw. A sliding paw takes one step, see `sliding_impulse`.
+    impulse [N s] and velocity [m/s]: current values at this paw. A paw that could both stick and separate sticks.
     """
     n = c.normal
     stick = impulse + c.total_inv * (c.goal * n - velocity)
@@ -153,10 +216,10 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     tangential = stick - normal * n
     if normal > real(0.0) and wp.dot(tangential, tangential) <= c.mu * c.mu * normal * normal:
         return stick
-    # separated if the velocity without this paw's impulse is admissible
-    if wp.dot(n, velocity - c.total * impulse) >= c.goal:
+    free = velocity - c.total * impulse
+    if wp.dot(n, free) >= c.goal:
         return vec3(real(0.0))
-    return sliding_impulse(c, impulse, velocity)
+    return sliding_impulse(c, free)
 
 
 @wp.func
