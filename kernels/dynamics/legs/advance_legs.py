@@ -66,8 +66,7 @@ class LegState:
     rounds: int  # largest number of rounds of the contact iteration in a step
     step: int  # steps completed in this launch
     sets: int  # sets of pressed stops tried for the present step and rejected
-    pressed: int  # the leg's set of pressed stops in the next attempt, see `stops`
-    used: int  # the leg's set of pressed stops in the last completed step
+    pressed: int  # the leg's set of pressed stops in the last completed step or for the next attempt, see `stops`
 
 
 @wp.struct
@@ -143,7 +142,7 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
         stops = load_stops(model.table, leg, world)
         if attempt.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
             attempt.stop_rates = stop_rates(stops, old.angles, dt)
-            if old.sets == 0:
+            if old.pressed == 0:
                 attempt.pressed = pressed_stops(attempt.stop_rates, old.rates, real(0.0), 0)
     return attempt
 
@@ -186,9 +185,8 @@ def completed_step(
     new.residual = wp.max(old.residual, solved.residual)
     new.rounds = wp.max(old.rounds, solved.rounds)
     new.step = old.step + 1
-    new.used = pressed
     new.sets = 0
-    new.pressed = 0
+    new.pressed = pressed
     return new
 
 

@@ -74,7 +74,7 @@ def rollout_legs_kernel(
             s = advance_leg(model, settings, drive, params, motors, world, leg, s, False)
         store_row_vec3(trajectory.torque, step, 3 * leg, world, torque)
         trajectory.impulse[step, leg, world] = s.impulse
-        trajectory.pressed[step, leg, world] = wp.uint8(s.used)
+        trajectory.pressed[step, leg, world] = wp.uint8(s.pressed)
         if step + 1 == (row + 1) * timing.every:
             if leg == 0:
                 store_row_base(trajectory, row + 1, world, com, s.base)
