@@ -29,7 +29,8 @@ PUSH_OUT_SPEED = wp.constant(real(1.0))  # largest speed of that push [m/s]
 CONTACT_MARGIN = wp.constant(real(0.02))  # [m] a paw is solved for if its free motion leaves a smaller gap
 STIFF_BAND = wp.constant(real(2.0e-6))  # [m] gaps up to this size, + or -, stay unchanged if the leg is on a hard stop
 STICK_SPEED = wp.constant(real(0.01))  # [m/s] contacts slower than this start the step with static friction
-SLIDE_TOLERANCE = wp.constant(real(1.0e-6))  # relative distance of a sliding paw's impulse from the friction cone
+# relative distance of a sliding paw's impulse from the friction cone
+SLIDE_TOLERANCE = wp.constant(real(1.0e-6 if real is wp.float32 else 1.0e-13))
 MAX_SLIDE_STEPS = wp.constant(24)  # of `sliding_impulse`; few are needed
 
 SEPARATE = wp.constant(0)  # modes of a contact
