@@ -1,11 +1,11 @@
 """Physics steps on GPUs: four threads per world, one per leg, which exchange sums for the base and the contacts.
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
-the one in `contact`. In each round all paws solve it at once for their next impulses; rounds end when no contact
-velocity changes by more than the tolerance. Paws are coupled through the base, little where legs are free to move, and
-strongly where they press stops: the rounds are accelerated by Anderson's method (`accelerated_impulse`). If they do not
-end soon, each later round applies only the impulse of the paw that changes most. A step whose set of pressed stops
-proves wrong (see `world_step`) is repeated by its world, while the other worlds of a warp continue.
+the one in `contact`. In each round all paws compute their next impulse at once, and all apply it, which converges
+because paws are coupled through the heavy base only; rounds end when no contact velocity changes by more than the
+tolerance. If the largest change stops shrinking, each later round applies only the impulse of the paw that changes
+most. A step whose set of pressed stops proves wrong (see `world_step`) is repeated by its world, while the other
+worlds of a warp continue.
 """
 
 import warp as wp
@@ -44,10 +44,8 @@ from ..step import (
     paw_contact,
 )
 
-ROUNDS_TOGETHER = wp.constant(16)  # rounds of the contact iteration after which one paw moves at a time
-# added to that problem [m^2/s^2], so that single precision can divide by its determinant
-MIXING_FLOOR = wp.constant(real(1.0e-14))
-MIXING_RIDGE = wp.constant(real(1.0e-5))  # relative, of the least-squares problem of `accelerated_impulse`
+SHRINKING = wp.constant(real(0.9))  # largest ratio of successive changes for which all paws move at once
+ANY_CHANGE = wp.constant(real(1.0e12))  # [m^2/s^2] square of the change before the first round: larger than any
 
 # fast_math: division and roots are exact to 2 units in the last place and take a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -82,96 +80,48 @@ class PawSolution:
     rounds: int  # of the iteration
 
 
-@wp.struct
-class PawRounds:
-    """The last round of a paw's contact iteration, and its difference from the round before; zero before the first."""
-
-    impulse: vec3  # solution of the paw's contact law [N s]
-    residual: vec3  # change of the contact velocity by that solution [m/s]
-    impulse_step: vec3
-    residual_step: vec3
-
-
-@wp.func
-def next_rounds(old: PawRounds, impulse: vec3, residual: vec3, rounds: int) -> PawRounds:
-    """Return the rounds of a paw after one more, with its impulse [N s] and residual [m/s]; rounds: number before."""
-    new = PawRounds()
-    new.impulse = impulse
-    new.residual = residual
-    if rounds > 0:
-        new.impulse_step = impulse - old.impulse
-        new.residual_step = residual - old.residual
-    return new
-
-
-@wp.func
-def accelerated_impulse(now: PawRounds, before: PawRounds) -> vec3:
-    """Return a paw's impulse [N s] for the next round by Anderson's method of depth two, over a world's four paws.
-
-    It subtracts from the last solution the combination of the last two steps whose residuals best match the last
-    residual (D. Anderson, J. ACM 12, 1965). before: as `now`, one round earlier.
-    """
-    first = now.residual_step
-    second = before.residual_step
-    a = sum_legs(wp.dot(first, first))
-    b = sum_legs(wp.dot(first, second))
-    d = sum_legs(wp.dot(second, second))
-    ridge = MIXING_RIDGE * (a + d) + MIXING_FLOOR
-    x = sum_legs(wp.dot(first, now.residual))
-    y = sum_legs(wp.dot(second, now.residual))
-    a += ridge
-    d += ridge
-    determinant = a * d - b * b
-    return now.impulse - ((d * x - b * y) * now.impulse_step + (a * y - b * x) * before.impulse_step) / determinant
-
-
 @wp.func
 def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_rounds: int, tolerance: real) -> PawSolution:
     """Solve a world's contact problem iteratively; in each round, four threads compute their paws' impulses at once.
 
     See the module; body axes. c: contact of this thread's leg 0 to 3. blocks: whether any world has a block. tolerance
-    [m/s]: see the module. The last round is applied as it is, so that each impulse satisfies its paw's friction cone.
+    [m/s]: see the module.
     """
     s = PawSolution()
     s.impulse = c.impulse
     s.lin = sum_vec(c.to_lin * c.impulse)
     s.ang = sum_vec(c.to_ang * c.impulse)
-    rounds = PawRounds()
-    working = bool(True)
+    working, together = bool(True), bool(True)
+    previous_change = real(ANY_CHANGE)
     while any_world(working):
         velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.leg_response * s.impulse
         if blocks:
             push = sum_vec(wp.where(c.on_block != 0, -s.impulse, vec3(real(0.0))))
             if c.on_block != 0:
                 velocity -= block_velocity(block, push)
-        impulse = s.impulse
+        step = vec3(real(0.0))
         if c.active != 0:
-            impulse = local_impulse(c, s.impulse, velocity)
-        residual = c.total * (impulse - s.impulse)
-        change = wp.dot(residual, residual)
+            step = local_impulse(c, s.impulse, velocity) - s.impulse
+        across = c.total * step
+        change = wp.dot(across, across)
         if not change > real(0.0):  # NaN too
-            change = real(0.0)
-            residual = vec3(real(0.0))
-            impulse = s.impulse
+            change, step = real(0.0), vec3(real(0.0))
         most = max_legs(change)
         chosen_leg = first_leg(change == most)
-        before = rounds
-        rounds = next_rounds(before, impulse, residual, s.rounds)
-        accelerated = accelerated_impulse(rounds, before)
-        last = wp.sqrt(most) <= tolerance or s.rounds + 1 >= max_rounds
-        if not last and s.rounds < ROUNDS_TOGETHER:
-            impulse = accelerated
-        if s.rounds >= ROUNDS_TOGETHER and leg != chosen_leg:
-            impulse = s.impulse
-        lin = sum_vec(c.to_lin * (impulse - s.impulse))
-        ang = sum_vec(c.to_ang * (impulse - s.impulse))
         if working:
             s.residual = wp.sqrt(most)
+        working = working and s.residual > tolerance and s.rounds < max_rounds
+        together = together and most <= SHRINKING * SHRINKING * previous_change
+        previous_change = most
+        if leg != chosen_leg and not together:
+            step = vec3(real(0.0))
+        lin = sum_vec(c.to_lin * step)
+        ang = sum_vec(c.to_ang * step)
+        if working:
             s.rounds += 1
             s.lin += lin
             s.ang += ang
-            s.impulse = impulse
-        working = working and not last
+            s.impulse += step
     return s
 
 
