@@ -242,7 +242,7 @@ def advance_leg(
         model, world, leg, base, lin, ang, rates, old.rates, old.impulse, pressed, terms.paw, terms.solve, inverse,
         block, dt,
     )  # fmt: skip
-    solved = solve_paws(contact, blocks, block, leg, 4 * settings.max_sweeps, settings.tolerance)
+    solved = solve_paws(contact, blocks, block, leg, 2 * settings.max_sweeps, settings.tolerance)
     solve = terms.solve
     rates += solve.inverse * (wp.transpose(contact.jacobian) * solved.impulse)
     rates -= solve.to_lin * solved.lin + solve.to_ang * solved.ang
