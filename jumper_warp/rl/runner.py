@@ -23,9 +23,9 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
+from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.logger import Stopwatch, TrainingLog, level_fractions
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
 from jumper_warp.rl.stop_request import StopRequest
