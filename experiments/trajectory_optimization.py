@@ -16,6 +16,10 @@ The farthest flight stays within 0.3 m of its start in stance, without a run-up,
 `farthest_*` change one limit (LIMITS) and also start from the farthest flight if it was
 optimised before. In vertical jumps only the paws touch the ground, the tilt is at most 8 degrees and the base stays
 within 0.15 m of its start. Work is the motors' positive work until takeoff.
+
+The file holds, in this order: the replay and its metrics (`MotionReplay`), random motions that begin a search
+(`squats`, `run_ups`), the families of jumps (`_far`, `_vertical`), the tables of jumps and limits (`JUMPS`, `LIMITS`),
+their optimisation (`optimise`), and the script (`Args`, `main`).
 """
 
 from __future__ import annotations

@@ -171,7 +171,8 @@ class Scores:
 
     def __init__(self, metric: str) -> None:
         """Begin without values; metric: name of the logged metric, higher is better."""
-        self._metric, self._values = metric, list[float]()
+        self._metric = metric
+        self._values: list[float] = []
 
     def add(self, metrics: dict[str, float]) -> None:
         """Add the value of a log line, if half of the worlds have reached the last curriculum level."""

@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import torch
 
+from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, aligned
-from jumper_warp.rl.networks import Moments
+from jumper_warp.rl.mirror import MirrorMap
+from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
 
 
 class Batch(NamedTuple):
@@ -106,3 +108,21 @@ def gae(
         weight = torch.cat([weight[:-reach] * weight[reach:], weight[-reach:]])
         reach *= 2
     return advantage, advantage + value[:-1]
+
+
+def update_statistics(model: ActorCritic, local: RolloutMoments, obs_mirror: MirrorMap | None, cfg: PpoCfg) -> Scaling:
+    """Update a model's running moments by those of a rollout over all ranks; return the normalisation of advantages.
+
+    local: moments of this rank's samples. obs_mirror: map that symmetrises those of the actor's observations.
+    """
+    moments = RolloutMoments(*all_reduce_moments(local))
+    obs_moments = moments.obs
+    if obs_mirror is not None:
+        symmetric = obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
+        obs_moments = Moments(*symmetric, obs_moments.count)
+    model.obs_moments.update_from_moments(obs_moments)
+    model.critic_moments.update_from_moments(moments.critic_obs)
+    if cfg.normalise_value:
+        model.value_moments.update_from_moments(moments.target)
+    mean, var, count = moments.advantage
+    return Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())

@@ -26,27 +26,12 @@ def test_help_and_lists_import_no_simulator(args):
 
 
 def test_interrupted_command_ends_with_130_and_no_traceback(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "jumper_warp",
-        "evaluate",
-        "vertical_jump",
-        "--device",
-        "cpu",
-        "--num-jumps",
-        "4096",
-    ]
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    arguments = "evaluate vertical_jump --device cpu --num-jumps 4096".split()
     run = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+        [sys.executable, "-m", "jumper_warp", *arguments], cwd=tmp_path, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
-    )
+    )  # fmt: skip
     first = run.stdout.readline()  # the command has begun
     run.send_signal(signal.SIGINT)
     rest = run.communicate()[0]

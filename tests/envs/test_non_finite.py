@@ -144,10 +144,11 @@ def test_dump_is_read_and_played(tmp_path, capsys):
 def test_observations_are_finite_and_bounded_whatever_their_terms_return():
     task = make_task("vertical-jump")
     actor = (ObservationTerm(below_twice, scale=1.0e6, history=2), *task.observations.actor)
-    observations = dataclasses.replace(task.observations, actor=actor)
+    critic = (ObservationTerm(below_twice, scale=1.0e6), *task.observations.critic)
+    observations = dataclasses.replace(task.observations, actor=actor, critic=critic)
     env = make_env(N, task=dataclasses.replace(task, observations=observations), reset=only("default"))
     lift(env, 3)
     env.step(REST)
-    columns = env.obs[:, :2]  # older frames of 1 and below
-    assert env.obs.isfinite().all() and env.obs.abs().max() == RAW_LIMIT
-    assert columns[0].tolist() == [RAW_LIMIT] * 2
+    for obs in (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs):
+        assert obs.isfinite().all() and obs.abs().max() == RAW_LIMIT
+    assert env.obs[0, :2].tolist() == [RAW_LIMIT] * 2

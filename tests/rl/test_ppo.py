@@ -218,6 +218,7 @@ def test_rewards_that_are_not_finite_reach_neither_networks_nor_statistics():
         ppo.update()
     assert ppo.rollout.reward.isfinite().all()
     assert all(value.isfinite().all() for value in ppo.model.state_dict().values())
+    assert ppo.model.features(torch.full((1, 2), 1e30)).abs().max() <= 10.0
     assert ppo.model.critic_features(torch.full((1, 3), 1e30)).abs().max() <= 10.0
     assert ppo.statistics()["Loss/skipped"] == 0.0
 

@@ -83,11 +83,14 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
             if self.steps == 40:  # in the third iteration of 16 steps
                 os.kill(os.getpid(), number)
 
-    before = signal.getsignal(number)
-    with pytest.raises(SystemExit) as caught:
-        train(dataclasses.replace(cfg, max_iterations=100), SignallingTask)
-    assert caught.value.code == 130
-    assert signal.getsignal(number) is before
+    ignored = signal.signal(number, signal.SIG_DFL)  # a job in the background ignores SIGINT, one of nohup SIGHUP
+    try:
+        with pytest.raises(SystemExit) as caught:
+            train(dataclasses.replace(cfg, max_iterations=100), SignallingTask)
+        assert caught.value.code == 130
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, ignored)
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
     assert load_checkpoint(path)["env"]["steps"] == 48
     *_, cause, last = capsys.readouterr().err.splitlines()

@@ -14,8 +14,8 @@ from jumper_warp.rl.fused.collector import FusedCollector
 from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
-from jumper_warp.rl.samples import Batch, RolloutMoments, gae
+from jumper_warp.rl.networks import ActorCritic, Moments
+from jumper_warp.rl.samples import Batch, RolloutMoments, gae, update_statistics
 
 SUM_BLOCK = 256  # Entries of the flat gradient in a block of the kernels that sum it
 ADAM_BLOCK = 1024  # Entries of the flat vector in a block of Adam's kernel
@@ -66,26 +66,12 @@ class FusedUpdate:
         reward = rollout.reward + cfg.gamma * rollout.timeout * scaling.denormalise(final_head)
         value = scaling.denormalise(head)
         advantage, target = (x.flatten() for x in gae(reward, rollout.done, value, cfg.gamma, cfg.lam))
-        advantage_scaling = self._update_statistics(Moments.from_samples(advantage), Moments.from_samples(target))
+        obs, critic_obs = self._collector.obs.moments(), self._collector.critic_obs.moments()
+        local = RolloutMoments(Moments.from_samples(advantage), Moments.from_samples(target), obs, critic_obs)
+        advantage_scaling = update_statistics(model, local, self._obs_mirror, cfg)
         normalised = (advantage_scaling.normalise(advantage), model.value_moments.scaling().normalise(target))
         columns = (head[:-1].flatten(), *normalised)
         self._samples[:, 2 * actions + 1 : 2 * actions + 4] = torch.stack(columns, dim=1)
-
-    def _update_statistics(self, advantage: Moments, target: Moments) -> Scaling:
-        """Update the moments of observations and returns; return the normalisation of advantages, () each."""
-        model, collector = self._model, self._collector
-        local = RolloutMoments(advantage, target, collector.obs.moments(), collector.critic_obs.moments())
-        moments = RolloutMoments(*all_reduce_moments(local))
-        obs_moments = moments.obs
-        if self._obs_mirror is not None:
-            symmetric = self._obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
-            obs_moments = Moments(*symmetric, obs_moments.count)
-        model.obs_moments.update_from_moments(obs_moments)
-        model.critic_moments.update_from_moments(moments.critic_obs)
-        if self._cfg.normalise_value:
-            model.value_moments.update_from_moments(moments.target)
-        mean, var, count = moments.advantage
-        return Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
 
     def batch(self) -> Batch:
         """Return the rollout's samples, time-major, as views; observations have the type of matrix products."""

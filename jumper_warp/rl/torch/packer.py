@@ -9,8 +9,8 @@ import torch
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
-from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, gae
+from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, gaussian_log_prob
+from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, gae, update_statistics
 from jumper_warp.rl.torch.rollout import RolloutBuffer
 
 CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensors stay in its caches
@@ -56,20 +56,9 @@ class BatchPacker:
     @torch.no_grad()
     def pack(self) -> None:
         """Compute advantages and returns, write the samples to `rows`, and update the normalisation statistics."""
-        model = self._model
         scalings = self._scalings()  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
-        moments = RolloutMoments(*all_reduce_moments(estimates.moments))
-        obs_moments = moments.obs
-        if self._obs_mirror is not None:
-            symmetric = self._obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
-            obs_moments = Moments(*symmetric, obs_moments.count)
-        model.obs_moments.update_from_moments(obs_moments)
-        model.critic_moments.update_from_moments(moments.critic_obs)
-        if self._cfg.normalise_value:
-            model.value_moments.update_from_moments(moments.target)
-        mean, var, count = moments.advantage
-        advantage_scaling = Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
+        advantage_scaling = update_statistics(self._model, estimates.moments, self._obs_mirror, self._cfg)
         self._pack(scalings, estimates, advantage_scaling)
         self.old_log_std.copy_(self._rollout.log_std)
 
