@@ -114,8 +114,8 @@ class DeployedPolicy:
         try:
             with np.errstate(over="ignore"):
                 value = np.atleast_1d(np.asarray(reading))
-                if np.iscomplexobj(value):
-                    raise TypeError("complex numbers")
+                if value.dtype.kind not in "fiub":
+                    raise TypeError(f"values of type {value.dtype}")
                 value = value.astype(np.float32)
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"{name} must be numbers, got {reading!r:.60}") from None

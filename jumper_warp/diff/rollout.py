@@ -31,6 +31,7 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.sim.slices import WorldRange, slices_of
 from jumper_warp.sim.solver import check_step
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
@@ -176,11 +177,12 @@ class Rollout(Uncopied):
     def hold(self, worlds: Any = True) -> None:
         """Fix the bases of some worlds at their initial pose and velocity; release those of the others.
 
-        worlds: bool, (num_worlds,) or one for all. Raises InputError: another shape.
+        worlds: bool, (num_worlds,) or one for all. Raises InputError: another shape or type.
         """
-        if np.shape(worlds) not in ((), (self.num_worlds,)):
-            raise InputError(f"worlds must be one bool, or ({self.num_worlds},), got {np.shape(worlds)}")
-        held = np.broadcast_to(np.asarray(worlds, dtype=np.int32), self.num_worlds)
+        held = np.asarray(worlds)
+        if held.dtype != bool or held.shape not in ((), (self.num_worlds,)):
+            raise InputError(f"worlds must be one bool, or ({self.num_worlds},), got {held.dtype} {held.shape}")
+        held = np.broadcast_to(held, self.num_worlds)
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
 
     def geometry(self) -> np.ndarray:
@@ -413,7 +415,7 @@ class Rollout(Uncopied):
             if values.device != self.device:
                 raise InputError(f"{name} must be on {self.device}, got an array on {values.device}")
             return values
-        values = np.asarray(values, dtype=np.float64)
+        values = real_array(values, name, np.float64)
         if values.shape == shape:
             values = np.repeat(values[..., None], self.num_worlds, axis=-1)
         if values.shape != full:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import warp as wp
+from torch.autograd.forward_ad import unpack_dual
 
 from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
@@ -51,11 +52,11 @@ def simulate(
 ) -> TorchTrajectory:
     """Simulate all worlds over policy steps as a PyTorch function, and return their trajectory.
 
-    It can be differentiated once w.r.t. all tensors except `impulse`: the reverse pass raises InputError if
-    `create_graph` is set. Arguments and shapes are those of `Rollout.run`, with or without the axis of worlds.
-    parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds; they are
-    written to the rollout and stay there, and have gradients only from the calls that they are passed to. trusted: do
-    not check the values; otherwise on a GPU only the latency is checked, which waits for the device.
+    It can be differentiated once, in reverse mode, w.r.t. all tensors except `impulse`: the reverse pass raises
+    InputError if `create_graph` is set. Arguments and shapes are those of `Rollout.run`, with or without the axis of
+    worlds. parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds;
+    they are written to the rollout and stay there, and have gradients only from the calls that they are passed to.
+    trusted: do not check the values; otherwise on a GPU only the latency is checked, which waits for the device.
 
     A policy in the loop runs one policy step per call, each from `end()` of the previous one. Raises InputError:
     unknown parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass
@@ -68,6 +69,8 @@ def simulate(
     for name, tensor in given.items() if impulse is None else [*given.items(), ("impulse", impulse)]:
         if not isinstance(tensor, torch.Tensor):
             raise InputError(f"{name} must be a torch tensor, got {type(tensor).__name__}")
+        if unpack_dual(tensor).tangent is not None:
+            raise InputError("simulate has no forward mode (jvp): use the reverse mode, such as backward")
         if tensor.is_complex():
             raise InputError(f"{name} must be of real numbers, got {tensor.dtype}")
     if targets.dim() == 0:

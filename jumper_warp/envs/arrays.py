@@ -16,6 +16,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_own_ranges
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
@@ -160,21 +161,9 @@ def to_numpy(values: Any) -> Any:
     return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
 
 
-def as_float32(values: Any, name: str) -> np.ndarray:
-    """Return a number, list, array or tensor as a float32 array; `name` is used in the error message.
-
-    Raises InputError: no rectangular array of numbers.
-    """
-    values = to_numpy(values)
-    try:
-        return np.asarray(values, dtype=np.float32)
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
-
-
 def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Return a scalar or array as float32 array of `shape`. Raises InputError: other shape, or not finite."""
-    array = as_float32(values, name)
+    array = real_array(to_numpy(values), name)
     if array.ndim and array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
@@ -230,7 +219,7 @@ def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) 
     mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
-    array, n, errors = as_float32(commands, "commands"), len(mask), []
+    array, n, errors = real_array(to_numpy(commands), "commands"), len(mask), []
     for task in tasks:
         try:
             task.command.check(array, task.name, mask > 0.0)

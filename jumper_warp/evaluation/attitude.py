@@ -10,6 +10,7 @@ import numpy as np
 
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
@@ -56,7 +57,7 @@ class AttitudeLog(EvaluationLog):
     spacing = 1.5
 
     def __post_init__(self) -> None:
-        self.turns, self.count = np.asarray(self.turns, dtype=float), len(self.turns)
+        self.turns, self.count = real_array(self.turns, "turns", float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment
 

@@ -13,6 +13,7 @@ from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.terms import TerminationTerm
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ class JumpLog(EvaluationLog):
 
         Below, arrays have shape (num_envs, jumps in a row, ...).
         """
-        goals = np.asarray(goals, dtype=float)
+        goals = real_array(goals, "goals", float)
         if goals.ndim == 1:
             goals = goals[:, None, None] * [0.0, 0.0, 1.0]
         fits = goals.ndim == 3 and goals.shape[2] in (2, 3)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from jumper_warp.evaluation.jumps import wrapped
 from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
@@ -49,9 +50,9 @@ class VelocityLog(EvaluationLog):
     def __post_init__(self) -> None:
         self.count = len(self.commands)
         self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
-        self.times = np.asarray(self.times, dtype=float)
+        self.times = real_array(self.times, "times", float)
         self.step_dt = 0.0  # [s] Policy step; `begin` sets it
-        self._slew = np.broadcast_to(np.asarray(self.slew, dtype=float), self.count)
+        self._slew = np.broadcast_to(real_array(self.slew, "slew", float), self.count)
         # (robots,) horizontal distance from the start [m], and yaw relative to the heading [rad]; until the fall
         self.distance, self.yaw, self._start = np.zeros(self.count), np.zeros(self.count), np.zeros((self.count, 3))
         self._command = np.zeros((self.count, 3))  # commands of the next policy step

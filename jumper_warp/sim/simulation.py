@@ -23,6 +23,7 @@ from jumper_warp.sim.overlay import write_model, write_motors, write_springs
 from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
@@ -159,10 +160,10 @@ class Simulation(Uncopied):
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
         """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
 
-        Raises InputError: another shape, or not finite.
+        Raises InputError: another shape or type, or not finite.
         """
         array: Any = angles
-        values = np.asarray(array.detach().cpu() if hasattr(array, "detach") else array, dtype=np.float32)
+        values = real_array(array.detach().cpu() if hasattr(array, "detach") else array, "targets")
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
         if not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Atomic writing of NumPy archives (.npz), and reading of those of limited size."""
+"""Check of arrays of numbers, atomic writing of NumPy archives (.npz), and reading of those of limited size."""
 
 from __future__ import annotations
 
@@ -11,6 +11,20 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file, write_atomically
+
+
+def real_array(values: Any, name: str, dtype: Any = np.float32) -> np.ndarray:
+    """Return a number, list or array as an array of a floating-point `dtype`; name: for messages.
+
+    Raises InputError: it is not rectangular, or holds other than integers and floating-point numbers.
+    """
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"values of type {array.dtype}")
+        return array.astype(dtype, copy=False)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{name} must be an array of numbers, got {type(values).__name__}: {error}") from error
 
 
 def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[str, np.ndarray]:

@@ -2,9 +2,14 @@
 
 import dataclasses
 import math
+from functools import partial
 
+import numpy as np
 import pytest
 
+from jumper_warp.evaluation.attitude import AttitudeLog
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.velocities import VelocityLog
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PPO_BOUNDS, PpoCfg, TrainCfg
@@ -68,6 +73,16 @@ def test_field_of_another_type_is_refused_by_name(cfg):
         for value in ("5", ("5", "5"), b"5", [1.0]):
             with pytest.raises(InputError, match=f" {name} must be "):
                 dataclasses.replace(cfg, **{name: value})
+
+
+@pytest.mark.parametrize(
+    "log",
+    [AttitudeLog, partial(JumpLog, terminations=("success",)), partial(VelocityLog, np.zeros((1, 1, 3)), None, 1.0)],
+)
+def test_evaluation_refuses_other_than_numbers(log):
+    for values in (np.full(1, 0.5j), np.array(["0.5"])):
+        with pytest.raises(InputError, match="must be an array of numbers"):
+            log(values)
 
 
 @pytest.mark.parametrize(

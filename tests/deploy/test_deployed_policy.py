@@ -272,8 +272,10 @@ def test_jump_command_refuses_a_takeoff_speed_that_no_robot_reaches(speed):
 def test_refuses_readings_of_another_type():
     policy = onnx_of("vertical_jump")
     readings = zero_readings(policy)
-    with pytest.raises(InputError, match="angle must be numbers"):
-        policy.targets(readings | {"angle": readings["angle"] + 0.5j})
+    angle = np.zeros(12)
+    for wrong in (angle + 0.5j, angle.astype(str), angle.astype("datetime64[s]")):
+        with pytest.raises(InputError, match="angle must be numbers"):
+            policy.targets(readings | {"angle": wrong})
     for other in (None, 1):
         with pytest.raises(InputError, match="readings must be a mapping"):
             policy.targets(other)

@@ -189,6 +189,25 @@ def test_second_derivatives_are_refused():
     assert torch.equal(first, again)
 
 
+def test_forward_mode_is_refused():
+    of, (q, qd) = rollout(), tensors()
+    targets = torch.zeros(2, 12, dtype=torch.float64)
+    with pytest.raises(InputError, match="simulate has no forward mode"):
+        torch.func.jvp(lambda values: simulate(of, values, q, qd).q, (targets,), (targets,))
+    with torch.autograd.forward_ad.dual_level(), pytest.raises(InputError, match="simulate has no forward mode"):
+        simulate(of, torch.autograd.forward_ad.make_dual(targets, targets), q, qd)
+
+
+def test_inputs_of_another_type_are_refused():
+    of, targets, (q, qd) = rollout(), np.zeros((2, 12)), squat()
+    for wrong in (targets + 0.5j, targets.astype(str), targets > 0.0):
+        with pytest.raises(InputError, match="targets must be an array of numbers"):
+            of.run(wrong, q, qd)
+    for wrong in (None, "1", 1):
+        with pytest.raises(InputError, match="worlds must be one bool"):
+            of.hold(wrong)
+
+
 def test_reverse_pass_refuses_changed_outputs_and_parameters():
     of, (q, qd) = rollout.__wrapped__(), tensors()  # not cached: its parameters change
     targets = torch.tensor(push_off(2)).requires_grad_()

@@ -112,18 +112,23 @@ def test_reward_terms_add_up_to_the_reward():
 
 # ---------------------------------------------------------------- commands
 
+NO_NUMBERS = (np.full(3, 0.5 + 1.0j), ["0", "0", "0.7"], [True] * 3, np.full(3, "2026-01-01", dtype="datetime64[s]"))
 WRONG_COMMANDS = [
     (np.zeros((3, 4)), r"x \[m\], y \[m\], height \[m\], .*, 8 rows or one for all, got shape \(3, 4\)"),
     (np.tile([0.0, 0.0, -5.0], (N, 1)), r"height \[m\] must be at least 0, got -5"),
     (np.tile([0.0, 0.0, 0.9, -1.0], (N, 1)), "policy step of the command .* must be at least 0, got -1"),
     (np.full((N, 3), NAN), "commands must be finite"),
-    ("up", "commands must be an array of numbers, got str"),
+    *((values, "commands must be an array of numbers") for values in ("up", *NO_NUMBERS)),
 ]
 WRONG_WORLDS = [
     (np.zeros(3, dtype=bool), r"worlds must be bool of shape \(8,\), got bool of shape \(3,\)"),
     (np.zeros(N), "got float64"),
 ]
-WRONG_HEADINGS = [(np.zeros(3), r"headings must have shape \(8,\), got \(3,\)"), (NAN, "headings must be finite")]
+WRONG_HEADINGS = [
+    (np.zeros(3), r"headings must have shape \(8,\), got \(3,\)"),
+    (NAN, "headings must be finite"),
+    (1.0j, "headings must be an array"),
+]
 
 
 @pytest.mark.parametrize(("commands", "message"), WRONG_COMMANDS)

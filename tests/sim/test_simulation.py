@@ -216,7 +216,7 @@ def test_set_targets_broadcasts_and_refuses_bad_targets():
         np.testing.assert_array_equal(sim.target.numpy(), angles.astype(np.float32))
     sim.set_targets(angles[:, 1])
     np.testing.assert_array_equal(sim.target.numpy(), np.repeat(angles[:, 1:2], 3, axis=1).astype(np.float32))
-    for wrong in (angles.T, np.full(12, np.nan)):
+    for wrong in (angles.T, np.full(12, np.nan), angles + 0.5j, angles.astype(str), angles > 0.5):
         with pytest.raises(ValueError, match="targets must"):
             sim.set_targets(wrong)
 
