@@ -37,8 +37,10 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     n, device, robot = sim.num_worlds, sim.device, RobotArrays()
     robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
     robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
-    robot.diverged, robot.impulse = sim.physics.diverged, sim.physics.impulse
-    robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
+    robot.diverged = sim.dynamics.work.diverged
+    robot.impulse = sim.dynamics.work.impulse
+    robot.paw_force = sim.paw_force
+    robot.peak_force = sim.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
     motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")
     allocate(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
@@ -85,7 +87,7 @@ def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -
 
 def scene_of(sim: Simulation) -> Any:
     """Return the kernels' `Scene` (ground and robot constants) of a simulation."""
-    scene, robot = Scene(), sim.physics.dynamics.robot
+    scene, robot = Scene(), sim.dynamics.robot
     scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
     return scene
 

@@ -11,7 +11,6 @@ import warp as wp
 
 from jumper_warp.robot.model import GROUND_COLOR, build_model
 from jumper_warp.sim.dynamics import find_ground
-from jumper_warp.sim.links import LinkReader
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.viz.film import DIRECTION
@@ -36,8 +35,10 @@ class WorldCamera:
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
         """Prepare images of the first `count` worlds; size: width and height [px]."""
-        self._count, self._size, self._links = count, size, LinkReader(sim)
-        self._ground = sim.physics.dynamics.robot.ground
+        self._count = count
+        self._size = size
+        self._sim = sim
+        self._ground = sim.dynamics.robot.ground
         shape = find_ground(sim.model)
         self._is_field = shape >= 0 and sim.model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD)
         self._heights = self._ground.heights.numpy()
@@ -53,7 +54,7 @@ class WorldCamera:
 
     def images(self) -> list[np.ndarray]:
         """Return an image of each world's current state, (height, width, 3) uint8, RGB. Waits for the device."""
-        links = self._links.read()[0][: self._count].astype(float)
+        links = self._sim.links()[0][: self._count].astype(float)
         self._follow(links[:, 0, :3])
         scenery, blocks = self._present_scenery()
         renderer = self._renderer_of(scenery)

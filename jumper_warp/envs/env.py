@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from jumper_warp.envs.arrays import (
     checked_worlds,
     prepared_tasks,
 )
-from jumper_warp.envs.stages import Stages, usual_kernels
+from jumper_warp.envs.stages import Stages, WorldSlice, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
@@ -28,9 +28,8 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.sim.dynamics import advance_kernel
-from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
-from jumper_warp.sim.slices import SlicedGraph
+from jumper_warp.sim.dynamics import WorldRange, advance_kernel
+from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
 from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
@@ -136,7 +135,7 @@ class Env(Stages):
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
         if self._draws_ground:
-            self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
+            self.sim.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
         self._allocate(run, skill, handovers, moves_of(robot))
@@ -240,6 +239,31 @@ class Env(Stages):
             self._graphs[resets].replay()
         return self._step
 
+    def _launch_step(self, worlds: WorldRange | None = None) -> None:
+        """Launch all stages of a policy step for a range of worlds (default: all)."""
+        for stage in self.stages(worlds).values():
+            stage()
+
+    def _advance_physics(self, part: WorldSlice) -> None:
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
+        delays = self.delays
+        self.sim.advance(
+            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
+            worlds=WorldRange(part.first, part.count),
+        )  # fmt: skip
+        self._track(part)
+
+    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
+        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
+
+        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
+        """
+        part = self._part(worlds)
+        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance_physics(part),
+                "episode": lambda: self._compute_rewards_and_dones(part),
+                "observe": lambda: self._observe(part, after_reset=0),
+                "reset": lambda: self._reset_done(part)}  # fmt: skip
+
     def set(self, name: str, value: float, skill: int = 0) -> None:
         """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
@@ -334,10 +358,10 @@ class Env(Stages):
         sim, n = self.sim, self.num_envs
         past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
-        dynamics = sim.physics.dynamics
+        dynamics = sim.dynamics
         return Snapshot(
             tasks=tuple(skill.task for skill in self.skills),
-            solver=type(sim.solver).__name__,
+            solver=sim.dynamics.solver_name,
             blocks=dynamics.robot.ground.blocks.shape[0] > 0,
             model=sim.model,
             dt=sim.dt,
@@ -397,7 +421,7 @@ class Env(Stages):
             "physics_dt_s": self.physics_dt,
             "policy_dt_s": self.step_dt,
             "contact_tolerance_m_s": CONTACT_TOLERANCE,
-            "solver": type(self.sim.solver).__name__,
+            "solver": self.sim.dynamics.solver_name,
             "randomize": self.conditions[0],
             "noise": self.conditions[1],
             "quaternion_order": "xyzw",

@@ -43,7 +43,7 @@ def robot_parameters(
         setattr(robot, f"nominal_{short}", wp.array(first_world, dtype=array.dtype, device=device))
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
-    robot.static_ratio = sim.physics.dynamics.static_friction_ratio
+    robot.static_ratio = sim.dynamics.static_friction_ratio
     robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
     overlay = sim.robot
     latency = 0 if overlay is None else round(float(overlay.latency[0, 0]) / sim.dt)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +27,8 @@ from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
+from jumper_warp.sim.dynamics import WorldRange
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
 from jumper_warp.utils.copying import Uncopied
@@ -115,7 +115,7 @@ class Stages(Uncopied):
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
-        self.sim.physics.parameters_changed()
+        self.sim.dynamics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return the kernels of `step`, and of `reset` if draws, else `evaluation_reset`, each with its block size."""
@@ -123,7 +123,7 @@ class Stages(Uncopied):
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
         kernels = usual_kernels([skill.task for skill in self.skills], draws)
-        return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.physics.kernels()]
+        return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.dynamics.step_kernels()]
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""
@@ -135,36 +135,15 @@ class Stages(Uncopied):
         env.first, env.slice = worlds.first, self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
         return WorldSlice(*worlds, env)
 
-    def _launch_step(self, worlds: WorldRange | None = None) -> None:
-        """Launch all stages of a policy step for a range of worlds (default: all)."""
-        for stage in self.stages(worlds).values():
-            stage()
-
-    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
-        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
-
-        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
-        """
-        part = self._part(worlds)
-        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
-                "episode": lambda: self._compute_rewards_and_dones(part),
-                "observe": lambda: self._observe(part, after_reset=0),
-                "reset": lambda: self._reset_done(part)}  # fmt: skip
-
     def _apply_actions(self, part: WorldSlice) -> None:
         """Convert actions to motor targets and wrenches, then run interval events."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
-    def _advance(self, part: WorldSlice) -> None:
-        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
-        delays, scene = self.delays, self._scene
-        self.sim.physics.advance(
-            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
-            worlds=WorldRange(part.first, part.count),
-        )  # fmt: skip
-        inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]
+    def _track(self, part: WorldSlice) -> None:
+        """Update paw kinematics, contacts and collisions after the physics of a policy step."""
+        inputs = [self._scene.geometry, self._scene.ground, self._settings, part.episode, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
     def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
@@ -248,13 +227,13 @@ class Stages(Uncopied):
                      skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.update_solver for slot in due.values()):
-                self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
+                self.sim.dynamics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
         """Clear actions, contacts, delays and the solver's warm start where mask is nonzero."""
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
-        self.sim.physics.after_reset(mask)
+        self.sim.dynamics.after_reset(mask)
 
     def _clear_results(self, mask: wp.array) -> None:
         """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""

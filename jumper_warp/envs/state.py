@@ -140,7 +140,7 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
 
 def _records(env: Stages) -> dict[str, wp.array]:
     """Return an environment's arrays of structs (task states, any blocks) that are saved, by prefix of their keys."""
-    blocks = env.sim.physics.dynamics.robot.ground.blocks
+    blocks = env.sim.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})
 
@@ -155,7 +155,7 @@ def _tensors(env: Stages) -> dict[str, torch.Tensor]:
             if name not in CONSTANT and not name.startswith("nominal_"):
                 arrays[f"{prefix}.{name}"] = getattr(struct, name)
     arrays |= {f"motors.{name}": getattr(env.sim.motors, name) for name in MOTORS}
-    arrays |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
+    arrays |= {f"solver.{name}": array for name, array in env.sim.dynamics.carried().items()}
     for skill in env.skills:
         arrays |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
         own = {"timer": skill.timer, "changed": skill.params.changed, "episode_sum": skill.episode_sum}

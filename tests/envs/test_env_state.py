@@ -98,7 +98,7 @@ def assert_equal_steps(saved, fresh):
         for name in ("obs", "critic_obs", "final_obs", "final_critic_obs", "reward", "done", "timeout"):
             assert torch.equal(getattr(saved, name), getattr(fresh, name)), (step, name)
         np.testing.assert_array_equal(saved.sim.joint_qd(), fresh.sim.joint_qd())
-        table, expected = (env.sim.physics.dynamics.robot.table.numpy() for env in (fresh, saved))
+        table, expected = (env.sim.dynamics.robot.table.numpy() for env in (fresh, saved))
         np.testing.assert_array_equal(table, expected)
         ended += saved.done.sum().item()
         yield step
@@ -132,14 +132,14 @@ def test_an_environment_continues_bitwise_with_sampled_ground():
     saved, fresh = ground_env(), ground_env()
     for action in random_actions(N, 5):
         saved.step(action)
-    blocks = saved.sim.physics.dynamics.robot.ground.blocks
+    blocks = saved.sim.dynamics.robot.ground.blocks
     sliding = blocks.numpy().copy()
     assert sliding["exists"].any() and not sliding["exists"].all()
     sliding["velocity"] = 0.3 * sliding["exists"][:, None]
     blocks.assign(sliding)
     fresh.load_state_dict(saved.state_dict())
     for step in assert_equal_steps(saved, fresh):
-        found, expected = (env.sim.physics.dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
+        found, expected = (env.sim.dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
         assert (found == expected).all(), step
         if step == 0:
             moved = np.abs(expected["center"] - sliding["center"]).max(axis=1)
@@ -200,16 +200,16 @@ def test_every_randomised_parameter_is_restored_and_is_not_in_the_fingerprint():
         motors.offset, parameters.push, parameters.static_ratio, parameters.latency, parameters.observation_latency,
         parameters.gain_ratio, parameters.speed_ratio, parameters.torque_ratio,
     )  # fmt: skip
-    table = env.sim.physics.dynamics.robot.table.numpy().copy()
+    table = env.sim.dynamics.robot.table.numpy().copy()
     for array in arrays:
         values = array.numpy().copy()
         array.assign(values + 1)
-        env.sim.physics.parameters_changed()
+        env.sim.dynamics.parameters_changed()
         assert not equal(env.state_dict(), whole)
         assert torch.equal(nominal_fingerprint(env), whole["nominal"])
         env.load_state_dict(whole)
         np.testing.assert_array_equal(array.numpy(), values)
-        np.testing.assert_array_equal(env.sim.physics.dynamics.robot.table.numpy(), table)
+        np.testing.assert_array_equal(env.sim.dynamics.robot.table.numpy(), table)
 
 
 def test_an_environment_continues_bitwise_with_observation_latency_and_history():
