@@ -26,8 +26,8 @@ import warp as wp
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo, use_fused
 from jumper_warp.rl.graphs import CapturedProcedure
+from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.networks import gaussian_log_prob
-from jumper_warp.rl.ppo import Ppo
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -35,7 +35,6 @@ from support.scripts import DeviceArgs, report, run_script
 from support.timing import median_time
 
 if TYPE_CHECKING:
-    from jumper_warp.rl.fused.collector import FusedRollout
     from jumper_warp.rl.fused.ppo import FusedPpo
 
 SIZES = {"obs": 147, "critic_obs": 208, "action": 12}  # of the vertical jump with four observation steps
@@ -86,7 +85,7 @@ class RandomEnv:
         return order, [-1.0 if i % 4 < 2 and i < pairs else 1.0 for i in range(size)]
 
 
-def build(args: Args, device: torch.device, still: bool = False, **changes: object) -> Ppo:
+def build(args: Args, device: torch.device, still: bool = False, **changes: object) -> Learner:
     """Return compiled PPO on a `RandomEnv`, with weights of seed 0; changes: other settings, such as `fused=False`."""
     torch.manual_seed(0)
     cfg = PpoCfg(num_steps=args.num_steps, epochs=args.epochs, hidden=args.hidden, fused=True)
@@ -148,14 +147,14 @@ def repeats(args: Args, device: torch.device) -> bool:
     return all(map(torch.equal, *results))
 
 
-def times(ppo: Ppo, args: Args) -> dict[str, float]:
+def times(ppo: Learner, args: Args) -> dict[str, float]:
     """Return the times [us] of an acting step, an update and parts of a fused minibatch; on a GPU as CUDA graphs."""
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     parts: dict[str, Callable[[], object]] = {"collect": ppo.collect, "update": ppo.update}
     if ppo.cfg.fused:
         fused, samples = cast("FusedPpo", ppo), ppo.order()[: ppo.batch_size // ppo.cfg.minibatches].clone()
-        rollout = cast("FusedRollout", ppo.rollout)
+        rollout = fused.rollout
         parts |= {"gradient": lambda: fused.fused.compute_gradient(samples), "adam": fused.fused.update_parameters}
         for name, features in (("actor", rollout.features), ("critic", rollout.critic_features)):
             network, work = getattr(fused.networks, name), (features.flatten(0, 1), len(samples), samples)

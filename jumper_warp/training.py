@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from jumper_warp.policies.warm_start import actor_init_from_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
-from jumper_warp.rl.runner import TrainResult
+from jumper_warp.rl.run_folder import TrainResult
 from jumper_warp.tasks.mirror import mirror_of
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "diff.rollout", "diff.torch_rollout", "diff.closed_loop",
     )),
     "training": ("Training", (
-        "rl.cfg", "rl.runner", "rl.ppo", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
+        "rl.cfg", "rl.runner", "rl.learner", "rl.torch.ppo", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
         "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (

@@ -20,7 +20,7 @@ from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.learner import Learner
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.viz.plots import figure
 from support.timing import process_age
@@ -66,7 +66,7 @@ def places_ahead(limits: tuple[float, float], count: int) -> np.ndarray:
     return np.stack([np.linspace(*limits, count), np.zeros(count)], axis=1)[:, None]
 
 
-def success_rate(trainer: Ppo, eval_env: Env, limits: tuple[float, float] | None = None) -> float:
+def success_rate(trainer: Learner, eval_env: Env, limits: tuple[float, float] | None = None) -> float:
     """Return the success rate [1] of jumps to evenly spaced heights, or places ahead, one per world of `eval_env`.
 
     limits [m]: lowest and highest height or distance; None: those of TEST_RANGES.
@@ -77,7 +77,7 @@ def success_rate(trainer: Ppo, eval_env: Env, limits: tuple[float, float] | None
     return float(run_jumps(trainer.model.act, eval_env, goals).success.mean())
 
 
-def warm_up(env: VecEnv, trainer: Ppo) -> None:
+def warm_up(env: VecEnv, trainer: Learner) -> None:
     """Compile the environment's kernels and the trainer's functions, then reset all episodes."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
@@ -87,7 +87,7 @@ def warm_up(env: VecEnv, trainer: Ppo) -> None:
 
 
 def train_and_evaluate(
-    env: VecEnv, trainer: Ppo, eval_env: Env, length: float, every: float,
+    env: VecEnv, trainer: Learner, eval_env: Env, length: float, every: float,
     limits: tuple[float, float] | None = None, by_iterations: bool = False,
 ) -> LearningCurve:  # fmt: skip
     """Train for a time or a number of iterations, evaluate at intervals, and return the learning curve.

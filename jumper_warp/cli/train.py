@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from jumper_warp.recipe import Recipe
     from jumper_warp.rl.checkpoint import Checkpoint
-    from jumper_warp.rl.runner import TrainResult
+    from jumper_warp.rl.run_folder import TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,8 @@ class DeployedPolicy:
 
         Arguments and errors: see `targets`.
         """
+        if not isinstance(readings, Mapping):
+            raise InputError(f"readings must be a mapping from term to value, got {readings!r:.60}")
         different = sorted(map(str, set(readings) ^ (set(self.layout) - {LAST_ACTION})))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
@@ -248,7 +251,7 @@ class JumpCommand:
 
         Raises InputError: it is out of range.
         """
-        if not 0.0 < takeoff_speed <= 20.0:
+        if not isinstance(takeoff_speed, Real) or not 0.0 < takeoff_speed <= 20.0:
             raise InputError(f"takeoff_speed must be above 0 to 20 m/s, got {takeoff_speed!r:.40}")
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False

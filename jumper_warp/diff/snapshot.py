@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.newton_types import Model
 
 
@@ -14,6 +15,8 @@ class Snapshot(NamedTuple):
 
     Tensors are float32 on the environment's device and read-only; the next step may change them.
     """
+
+    __reduce__ = Uncopied.__reduce__
 
     tasks: tuple[Any, ...]
     """`jumper_warp.tasks.cfg.TaskCfg` of each skill, without the randomisation that the environment does not apply."""

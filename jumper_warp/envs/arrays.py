@@ -97,7 +97,7 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 
     task: a `TaskCfg` or several.
     Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
-    torque, over-speed protection or gravity; or a handover refers to another task.
+    torque, over-speed protection or gravity; or a handover is none, or refers to another task.
     """
     is_sequence = isinstance(task, Iterable) and not isinstance(task, str)
     tasks: tuple[Any, ...] = tuple(task) if is_sequence else (task,)
@@ -115,7 +115,9 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
             raise InputError(f"{each.name} and {names[0]} must have equal peak torque and over-speed protection")
         if each.gravity != tasks[0].gravity:
             raise InputError(f"gravity of {each.name} must be {tasks[0].gravity} m/s^2, got {each.gravity}")
-    for each in handovers:
+    for each in handovers if isinstance(handovers, Iterable) else (handovers,):
+        if not isinstance(each, Handover):
+            raise InputError(f"handovers must be a sequence of Handover, got {handovers!r:.60}")
         if each.source not in tasks or each.target not in tasks:
             raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
     return tasks

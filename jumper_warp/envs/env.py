@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -274,8 +275,8 @@ class Env(Stages):
         self.skills[skill].params.set(name, value)
 
     def _check_skill(self, skill: int) -> None:
-        if not 0 <= skill < len(self.skills):
-            raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
+        if not isinstance(skill, Integral) or not 0 <= skill < len(self.skills):
+            raise InputError(f"skill must be an index below {len(self.skills)}, got {skill!r:.40}")
 
     @locked
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:

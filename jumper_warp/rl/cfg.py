@@ -194,6 +194,15 @@ class TrainCfg:
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not supported with trainer {self.trainer}")
 
+    def check_processes(self, count: int) -> None:
+        """Raise InputError unless trainer, number of worlds and batch size are valid for a number of processes."""
+        if self.trainer != "ppo" and count > 1:
+            raise InputError(f"trainer {self.trainer} supports one process only")
+        if self.num_envs % count:
+            raise InputError(f"num_envs {self.num_envs} is not divisible by {count} processes")
+        if self.trainer == "ppo":
+            self.ppo.batch_size(self.num_envs // count)
+
 
 RSL_RL_UNUSED = (
     "log_interval", "max_checkpoints", "best_metric", "tensorboard", "wandb", "ppo.normalise_value",

@@ -121,3 +121,13 @@ def gather_states(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
         return []
     sent = [part[: int(size)].cpu().numpy().tobytes() for part, size in zip(parts, sizes, strict=True)]
     return [torch.load(io.BytesIO(part), weights_only=True) for part in sent]
+
+
+def other_states(local: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
+    """Gather the other ranks' states of environment, generators and episodes on rank 0; return [] elsewhere.
+
+    local: the state of this rank, with `ppo`, of which only `episode` differs between ranks.
+    """
+    if world_size() == 1:
+        return []
+    return gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, rank)[1:]

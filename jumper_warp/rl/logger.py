@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -163,6 +164,52 @@ class TrainingLog:
             with suppress(OSError):
                 self._events.close()
             self._events = None
+
+
+class Scores:
+    """Values of the metric that selects the best checkpoint, since the checkpoint before."""
+
+    def __init__(self, metric: str) -> None:
+        """Begin without values; metric: name of the logged metric, higher is better."""
+        self._metric, self._values = metric, list[float]()
+
+    def add(self, metrics: dict[str, float]) -> None:
+        """Add the value of a log line, if half of the worlds have reached the last curriculum level."""
+        levels, score = level_fractions(metrics), metrics.get(self._metric, math.nan)
+        at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
+        if math.isfinite(score) and (not levels or at_end >= 0.5):
+            self._values.append(score)
+
+    def mean(self) -> float | None:
+        """Return the mean of the values, None without any."""
+        return sum(self._values) / len(self._values) if self._values else None
+
+    def clear(self) -> None:
+        """Remove all values, since a checkpoint has them."""
+        self._values = []
+
+
+class NoLog:
+    """Null object for `TrainingLog` on all ranks but 0: it discards everything."""
+
+    def __enter__(self) -> NoLog:
+        """Return this log, which discards everything."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing, since no output is open."""
+
+    def print_line(self, line: str) -> None:
+        """Discard the line."""
+
+    def print_speed(self, rate: float, remaining: float) -> None:
+        """Discard the speed."""
+
+    def check_rate(self, rate: float) -> None:
+        """Discard the step rate."""
+
+    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
+        """Discard the metrics."""
 
 
 class _PipeSafeConsole(Console):

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
@@ -18,7 +18,19 @@ from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 
+INTERRUPTED = 130  # Exit code of a training that a signal stopped
+AsRslRl = Callable[[VecEnv, int], Any]
+"""Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
+
+
+class TrainResult(NamedTuple):
+    """Result of a training: the folder of the run, its length and last metrics."""
+
+    folder: Path  # the run's folder
+    iteration: int  # number of iterations, over all resumes
+    seconds: float  # wall-clock time of this process's iterations [s], including the first
+    metrics: dict[str, float]  # last logged metrics
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:

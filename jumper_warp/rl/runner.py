@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import sys
 import time
@@ -12,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch
 
@@ -21,13 +19,24 @@ from jumper_warp.rl import distributed, resume
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
+from jumper_warp.rl.clock import TrainingClock, is_last_iteration
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
-from jumper_warp.rl.logger import Stopwatch, TrainingLog, level_fractions
+from jumper_warp.rl.learner import STATISTICS
+from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
-from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
+from jumper_warp.rl.run_folder import (
+    CONFIG,
+    INTERRUPTED,
+    AsRslRl,
+    TrainResult,
+    full_config,
+    new_folder,
+    report_non_finite,
+    rescue_folder,
+    write_config,
+)
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
@@ -38,20 +47,8 @@ PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/el
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
 """Learning metrics in addition to the losses; those of Train/ exist only if an episode has ended."""
 WARM_UP = 5.0  # [s] A first iteration that takes longer measures the speed of a training on a CPU
-INTERRUPTED = 130  # Exit code of a training that a signal stopped
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Function that makes an environment from the number of worlds, the seed and the device."""
-AsRslRl = Callable[[VecEnv, int], Any]
-"""Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
-
-
-class TrainResult(NamedTuple):
-    """Result of a training: the folder of the run, its length and last metrics."""
-
-    folder: Path  # the run's folder
-    iteration: int  # number of iterations, over all resumes
-    seconds: float  # wall-clock time of this process's iterations [s], including the first
-    metrics: dict[str, float]  # last logged metrics
 
 
 def train(
@@ -73,7 +70,7 @@ def train(
     rank = distributed.init_distributed(cfg.device, cfg.threads)
     with ExitStack() as cleanup:
         cleanup.callback(_leave_process_group)
-        _check_processes(cfg, rank)
+        cfg.check_processes(rank.size)
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
             raise InputError("init_policy and actor_init, which is made from it, must be passed together")
@@ -82,7 +79,11 @@ def train(
             resume.check_unchanged(checkpoint)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
-            return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
+            if as_rsl_rl is None:
+                raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
+            from jumper_warp.rl.rsl_rl import run_rsl_rl
+
+            return run_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
         run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint, expected_rate)
         cleanup.callback(run.ppo.close)
@@ -109,23 +110,6 @@ def _leave_process_group() -> None:
         torch.distributed.destroy_process_group()
 
 
-def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
-    """Raise InputError unless trainer, number of worlds and batch size are valid for the number of processes."""
-    if cfg.trainer != "ppo" and rank.size > 1:
-        raise InputError(f"trainer {cfg.trainer} supports one process only")
-    if cfg.num_envs % rank.size:
-        raise InputError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
-    if cfg.trainer == "ppo":
-        cfg.ppo.batch_size(cfg.num_envs // rank.size)
-
-
-def _check_best_metric(name: str, logged: set[str]) -> None:
-    """Raise InputError unless `name` is the name of a logged metric."""
-    if name not in logged:
-        examples = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
-        raise InputError(f"best_metric must name a logged metric, such as {examples}, got {name!r:.60}")
-
-
 class TrainingRun:
     """State of a training in this process: algorithm, environment, folder, iteration, time."""
 
@@ -141,13 +125,16 @@ class TrainingRun:
         self._command, self._expected_rate = command or f"jumper train {cfg.task}", expected_rate
         self.ppo = make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in STATISTICS}
-        _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
+        logged = {*env.metrics(), *losses, *LEARNING, *PERF}
+        if cfg.best_metric not in logged:
+            examples = ", ".join(sorted(name for name in logged if name.startswith(("Metrics/", "Train/"))))
+            raise InputError(f"best_metric must name a logged metric, such as {examples}, got {cfg.best_metric!r:.60}")
         self.config = full_config(cfg, env, rank)
-        self.iteration, self.seconds = 0, 0.0  # of the run before this process
+        self.iteration = 0
+        self.clock = TrainingClock(cfg)
         self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
-        self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
-        self._scores: list[float] = []  # `best_metric` in logged iterations since the last checkpoint
+        self._scores = Scores(cfg.best_metric)
         self.notes: list[str] = []
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
@@ -176,7 +163,7 @@ class TrainingRun:
             local = resume.rank_state(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
-            self.seconds = resume.saved_seconds(state)
+            self.clock.seconds = resume.saved_seconds(state)
             resume.set_random_state(local["rng"])
         except DECODE_ERRORS as error:
             suffix = f" ({', '.join(lines)})" if lines else ""
@@ -201,18 +188,18 @@ class TrainingRun:
         with self._open_log() as log:
             for note in [f"run {self.folder}", *self.notes]:
                 log.print_line(note)
-            is_last = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
+            is_last = is_last_iteration(self.iteration, cfg, self.clock.is_over_time())
             if is_last:
                 complete = f"the training is complete at iteration {self.iteration}"
-                log.print_line(f"{complete}: raise {self._limit()} to continue")
+                log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
             while not is_last:
                 watch.start()
-                ppo.set_progress(self._progress())
+                ppo.set_progress(self.clock.progress(self.iteration))
                 ppo.iterate(partial(self._mark, watch, log))
                 stop.can_abort = False
                 self.iteration += 1
                 if self.iteration == first_iteration:
-                    self._start_clock()
+                    self.clock.start(self.rank.device)
                 is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
                 saves = self.iteration % cfg.save_interval == 0
                 logs = saves or self.iteration % cfg.log_interval == 0  # a checkpoint's score is of its last iterations
@@ -222,8 +209,8 @@ class TrainingRun:
                 if is_last or logs:
                     (times, seconds), self._is_timed = watch.read(), True
                     self.metrics = self._read_metrics(times)
-                    self._add_score()
-                    log.log(self.iteration, self.metrics, self._remaining(seconds))
+                    self._scores.add(self.metrics)
+                    log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
                 elif self.iteration == first_iteration or not self._is_timed:
                     self._print_speed(log, watch, self.iteration == first_iteration)
                 if is_last and not self.failure:
@@ -233,10 +220,10 @@ class TrainingRun:
                 stop.can_abort = True
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
-    def _open_log(self) -> TrainingLog | _NoLog:
+    def _open_log(self) -> TrainingLog | NoLog:
         """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
         if self.rank.index != 0:
-            return _NoLog()
+            return NoLog()
         cfg = self.cfg
         outputs = (cfg.max_iterations, self._steps(), cfg.tensorboard, cfg.wandb)
         return TrainingLog(self.folder, self.config, *outputs, self.iteration, self._expected_rate)
@@ -245,31 +232,26 @@ class TrainingRun:
         """Return the number of environment steps in an iteration, of all worlds."""
         return self.cfg.ppo.num_steps * self.cfg.num_envs
 
-    def _limit(self) -> str:
-        """Return the limit that ends the training, as a flag such as `--max-iterations 500`."""
-        ended = self.iteration >= self.cfg.max_iterations
-        return f"--max-iterations {self.cfg.max_iterations}" if ended else f"--max-seconds {self.cfg.max_seconds:g}"
-
     def _reason(self, stop: StopRequest) -> str:
         """Return a text about why the training ends, with the steps made if they are not all."""
         done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
         steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
-        return f"{'an interruption' if stop.requested else self._limit()}{steps}"
+        return f"{'an interruption' if stop.requested else self.clock.limit(self.iteration)}{steps}"
 
-    def _mark(self, watch: Stopwatch, log: TrainingLog | _NoLog) -> None:
+    def _mark(self, watch: Stopwatch, log: TrainingLog | NoLog) -> None:
         """Mark the end of a part of an iteration for timing; warn of a low step rate in a long first iteration."""
         watch.mark()
-        if self._clock_start is None and (seconds := watch.lap_time()) > WARM_UP:
+        if not self.clock.started and (seconds := watch.lap_time()) > WARM_UP:
             log.check_rate(self._steps() / seconds)
 
-    def _print_speed(self, log: TrainingLog | _NoLog, watch: Stopwatch, is_first: bool) -> None:
+    def _print_speed(self, log: TrainingLog | NoLog, watch: Stopwatch, is_first: bool) -> None:
         """Print a CPU's training speed; the first iteration counts only if it takes much longer than warm-up."""
         times, seconds = watch.read()
         if not self._is_timed and (seconds > WARM_UP or not is_first):
-            log.print_speed(self._steps() / sum(times), self._remaining(seconds))
+            log.print_speed(self._steps() / sum(times), self.clock.remaining(self.iteration, seconds))
             self._is_timed = True
 
-    def _check(self, log: TrainingLog | _NoLog) -> None:
+    def _check(self, log: TrainingLog | NoLog) -> None:
         """Report NaN and infinite terms; set `failure` if one of them or a deleted run folder ends the training."""
         folder, print_line = self.folder, partial(print, file=sys.stderr)
         if isinstance(log, TrainingLog):
@@ -282,36 +264,12 @@ class TrainingRun:
         if found and self.cfg.stop_on_nan:
             self.failure = self.failure or f"--stop-on-nan: {found[0]}"
 
-    def _start_clock(self) -> None:
-        """Start counting the training time, after synchronising with the device."""
-        if self.rank.device.type == "cuda":
-            torch.cuda.synchronize()
-        self._clock_start = time.perf_counter() - self.seconds
-
-    def _elapsed(self) -> float:
-        """Return the training time [s] over all resumes, counted as for `TrainCfg.max_seconds`."""
-        return self.seconds if self._clock_start is None else time.perf_counter() - self._clock_start
-
-    def _progress(self) -> float:
-        """Return the progress of the training, 0 to 1: the greater fraction of max_iterations and max_seconds."""
-        has_limit = self.cfg.max_seconds > 0.0
-        return max(
-            self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0
-        )
-
-    def _remaining(self, seconds: float) -> float:
-        """Return the estimated time to the end [s]; seconds: duration of an iteration [s]."""
-        remaining = (self.cfg.max_iterations - self.iteration) * seconds
-        if self.cfg.max_seconds > 0.0:
-            remaining = min(remaining, max(self.cfg.max_seconds - self._elapsed(), 0.0))
-        return remaining
-
     def sync_stop_request(self, stop: StopRequest) -> bool:
         """Return whether to end the training: a process has a stop request, a failure, or reached the time limit.
 
         Several processes synchronise this, `stop.requested` and `failure` only in logged iterations.
         """
-        over_time = 0.0 < self.cfg.max_seconds <= self._elapsed()
+        over_time = self.clock.is_over_time()
         failed = bool(self.failure)
         if distributed.world_size() > 1:
             if self.iteration % self.cfg.log_interval:
@@ -323,117 +281,32 @@ class TrainingRun:
 
     def _read_metrics(self, times: list[float]) -> dict[str, float]:
         """Return the metrics to log; times: of rollout and update [s], as in PERF."""
-        perf = (self._steps() / sum(times), *times, self._elapsed())
+        perf = (self._steps() / sum(times), *times, self.clock.elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
-    def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
+    def _save(self, log: TrainingLog | NoLog, is_last: bool, stop: StopRequest) -> None:
         """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one."""
-        seconds = self._elapsed()
+        seconds = self.clock.elapsed()
         local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
-        others = self._other_ranks(local)
+        others = distributed.other_states(local, self.rank)
         if self.rank.index != 0:
             return
         state = {"iteration": self.iteration, "seconds": seconds, **local, "others": others}
         state["config"] = json.dumps(self.config)
-        folder, scores = self.folder / CHECKPOINTS, self._scores
+        folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self._score(), self.cfg.max_checkpoints)
+            path = save_checkpoint(folder, state, self._scores.mean(), self.cfg.max_checkpoints)
         except OSError as error:
-            self._scores = scores
             if is_last:
                 raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
             log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
+        self._scores.clear()
         if is_last:
             hint = f", continue with: {self.resume_command}"
             log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
-
-    def _add_score(self) -> None:
-        """Add the logged `best_metric` to the scores once half of the worlds have reached the last curriculum level."""
-        levels, score = level_fractions(self.metrics), self.metrics.get(self.cfg.best_metric, math.nan)
-        at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
-        if math.isfinite(score) and (not levels or at_end >= 0.5):
-            self._scores.append(score)
-
-    def _score(self) -> float | None:
-        """Remove the scores since the last checkpoint and return their mean, which selects the best; None without."""
-        scores, self._scores = self._scores, []
-        return sum(scores) / len(scores) if scores else None
 
     @property
     def resume_command(self) -> str:
         """Command line that resumes this run."""
         return f"{self._command} --resume {shlex.quote(str(self.folder))}"
-
-    def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
-        """Gather the other ranks' states of environment, generators and episodes on rank 0; return [] elsewhere."""
-        if distributed.world_size() == 1:
-            return []
-        return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
-
-
-def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
-    """Return whether a run ends after `iteration` iterations; end_early: a stop request or the time limit."""
-    return end_early or iteration >= cfg.max_iterations
-
-
-class _NoLog:
-    """Null object for `TrainingLog` on all ranks but 0: it discards everything."""
-
-    def __enter__(self) -> _NoLog:
-        """Return this log, which discards everything."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing, since no output is open."""
-
-    def print_line(self, line: str) -> None:
-        """Discard the line."""
-
-    def print_speed(self, rate: float, remaining: float) -> None:
-        """Discard the speed."""
-
-    def check_rate(self, rate: float) -> None:
-        """Discard the step rate."""
-
-    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
-        """Discard the metrics."""
-
-
-def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
-    """Train a policy with rsl-rl's PPO in a new run folder; arguments, result and SystemExit: see `train`."""
-    if as_rsl_rl is None:
-        raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
-    from jumper_warp.rl.rsl_rl import train_rsl_rl
-
-    folder, config = new_folder(cfg, rank), full_config(cfg, env, rank)
-    print_line = partial(print, file=sys.stderr)
-    print_line(f"run {folder}")
-    write_config(folder, config)
-    begin = time.perf_counter()
-    torch.manual_seed(cfg.seed + rank.index)
-    env.reset()
-    adapter = as_rsl_rl(env, cfg.ppo.num_steps)
-    clock_start, failure = math.inf, ""  # the end of the first iteration; the reason of exit status 1
-
-    def end_in(iteration: int) -> Path | None:
-        """Return the folder for the last checkpoint if the training is over after this iteration, else None."""
-        nonlocal clock_start, failure
-        stop.can_abort = False
-        clock_start = min(clock_start, now := time.perf_counter())
-        kept, failure = rescue_folder(folder, config, [CONFIG])
-        found = report_non_finite(env, kept, config, iteration, print_line)
-        if found and cfg.stop_on_nan:
-            failure = failure or f"--stop-on-nan: {found[0]}"
-        over_time = 0.0 < cfg.max_seconds <= now - clock_start
-        stop.can_abort = not is_last_iteration(iteration, cfg, bool(failure) or stop.requested or over_time)
-        return None if stop.can_abort else kept
-
-    with write_lock(folder), StopRequest() as stop:
-        settings = (cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder, end_in)
-        iteration = train_rsl_rl(adapter, *settings).current_learning_iteration + 1
-    if failure:
-        raise SystemExit(f"jumper: {failure}")
-    if stop.requested:
-        raise SystemExit(INTERRUPTED)
-    return TrainResult(folder, iteration, time.perf_counter() - begin, {})

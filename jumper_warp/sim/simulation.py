@@ -146,6 +146,8 @@ class Simulation(Uncopied):
         if solver not in ("jumper", "mujoco"):
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         check_flags(keep_momentum=keep_momentum, observe_forces=observe_forces, visuals=visuals)
+        if not isinstance(block, BlockCfg | None):
+            raise InputError(f"block must be a BlockCfg, got {block!r:.60}")
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):

@@ -65,6 +65,8 @@ class TaskParams:
 
     def index(self, name: str) -> int:
         """Return the index of a term's parameter by its dotted name. Raises InputError: there is none."""
+        if not isinstance(name, str):
+            raise InputError(f"the name of a number must be text like rewards.jump_height.weight, got {name!r:.60}")
         if name not in self.names:
             section, _, rest = name.partition(".")
             term, _, key = rest.rpartition(".")

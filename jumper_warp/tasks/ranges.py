@@ -8,18 +8,19 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.utils.checks import MOST_SETTING, check_bounds
+from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_types
 from jumper_warp.utils.errors import InputError
 
 Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
-    """Raise InputError unless the numbers of a settings dataclass are within bounds, and its pairs are (lower, upper).
+    """Raise InputError unless a settings dataclass has numbers within bounds, and (lower, upper) where it has pairs.
 
     Bounds: ±MOST_SETTING.
     prefix: before field names in messages. skip: fields to leave unchecked. not_negative: fields that must be >= 0.
     """
+    check_types(prefix, cfg)
     for name, value in vars(cfg).items():
         if name in skip:
             continue

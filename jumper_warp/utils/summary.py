@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -117,8 +118,8 @@ def _file_lines(folder: Path, films: Sequence[Path]) -> Iterable[str]:
     films: a line for each of these, which may have the suffix of a picture.
     """
     yield from (f"{'film':9}  {path}" for path in films)
-    known = {path.resolve() for path in films}
-    paths = [path for path in folder.iterdir() if path.resolve() not in known]
+    known = {os.path.realpath(path) for path in films}
+    paths = [path for path in folder.iterdir() if os.path.realpath(path) not in known]  # `resolve` refuses link loops
     for kind, ends in KINDS.items():
         found = sorted(path for path in paths if path.suffix in ends and path.is_dir() == (kind == "folder"))
         if len(found) > MOST_PATHS:

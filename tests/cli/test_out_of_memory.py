@@ -6,7 +6,7 @@ import torch
 from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.envs.env import Env
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 
 ARGS = ["vertical-jump", "--device", "cpu", "--no-tensorboard", "--num-envs", "8", "--max-iterations", "3",
         "--save-interval", "1", "--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]  # fmt: skip

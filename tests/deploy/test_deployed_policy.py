@@ -263,17 +263,20 @@ def test_refuses_weights_in_another_file_than_the_checksum_covers(tmp_path, monk
         DeployedPolicy("policy.onnx")
 
 
-@pytest.mark.parametrize("speed", [math.nan, -1.0, 0.0, math.inf])
+@pytest.mark.parametrize("speed", [math.nan, -1.0, 0.0, math.inf, "x", None])
 def test_jump_command_refuses_a_takeoff_speed_that_no_robot_reaches(speed):
     with pytest.raises(InputError, match="takeoff_speed must be above 0 to 20 m/s"):
         JumpCommand(speed)
 
 
-def test_refuses_a_complex_reading():
+def test_refuses_readings_of_another_type():
     policy = onnx_of("vertical_jump")
     readings = zero_readings(policy)
     with pytest.raises(InputError, match="angle must be numbers"):
         policy.targets(readings | {"angle": readings["angle"] + 0.5j})
+    for other in (None, 1):
+        with pytest.raises(InputError, match="readings must be a mapping"):
+            policy.targets(other)
 
 
 @pytest.mark.parametrize("values", [(1.0e30, 4), (0.0, -1), (0.0, 5)])  # vertical velocity [m/s], paws down

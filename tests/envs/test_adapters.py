@@ -14,7 +14,7 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.gym import env_id
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.rl.ppo import STATISTICS
+from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
 from jumper_warp.rl.runner import LEARNING, PERF
 from jumper_warp.tasks.randomization import RandomizationCfg

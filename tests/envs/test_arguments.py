@@ -1,6 +1,8 @@
 """Arguments of other types: integers of NumPy and torch are counts, and texts are no flags."""
 
+import copy
 import json
+import pickle
 
 import gymnasium
 import numpy as np
@@ -68,3 +70,34 @@ def test_refuses_a_text_as_a_flag(make, name):
 def test_a_bool_of_numpy_is_a_flag():
     assert Env(hold_height(), 2, device="cpu", randomize=np.bool_(False)).config()["randomize"] is False
     assert TerminationTerm(hold_height().terminations[0].func, success=np.bool_(True)).options["success"] is True
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ({"block": 3}, "block must be a BlockCfg, got 3"),
+        ({"handovers": 3}, "handovers must be a sequence of Handover, got 3"),
+        ({"handovers": [3]}, r"handovers must be a sequence of Handover, got \[3\]"),
+    ],
+)
+def test_refuses_another_type_of_an_argument(argument, message):
+    with pytest.raises(InputError, match=message):
+        Env(hold_height(), 2, device="cpu", **argument)
+
+
+def test_refuses_another_type_of_a_number_or_skill_to_set():
+    env = Env(hold_height(), 2, device="cpu")
+    for name in (None, 5, ("rewards",)):
+        with pytest.raises(InputError, match="the name of a number must be text"):
+            env.set(name, 1.0)
+    for skill in (None, "0", 0.0, 1):
+        with pytest.raises(InputError, match="skill must be an index below 1"):
+            env.set("rewards.near_goal.weight", 1.0, skill)
+
+
+def test_a_snapshot_can_be_neither_copied_nor_pickled():
+    env = Env(hold_height(), 2, device="cpu")
+    env.reset()
+    for save in (pickle.dumps, copy.deepcopy):
+        with pytest.raises(TypeError, match="Snapshot can be neither copied nor pickled"):
+            save(env.snapshot())

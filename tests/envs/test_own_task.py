@@ -15,7 +15,7 @@ from columns import Z
 from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.rl.torch.ppo import Ppo
 
 torch.set_num_threads(1)  # on matrices this small, threads mostly wait for each other
 SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)

@@ -9,7 +9,7 @@ import torch
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.mirror import contract_layers, expand_layers, nearest_expanded_layers, symmetry_of
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask
 

@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from toy_task import SMALL, PushTask, fill
 
 SHORT = dataclasses.replace(SMALL, num_steps=8)

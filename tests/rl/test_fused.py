@@ -10,7 +10,7 @@ from fused_runs import FUSED, NoiseTask, interpreted, iterations, minibatch_grad
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from ppo_oracle import reference_losses
 from toy_task import PushTask, equal, free_port
 

@@ -4,7 +4,7 @@ import pytest
 from jump_helpers import make_env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 
 N = 8
 LIMIT = 24  # policy steps of the longest episode

@@ -9,8 +9,9 @@ from tensordict import TensorDict
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import adapted_lr
-from jumper_warp.rl.ppo import STATISTICS, Ppo
+from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.samples import Batch, gae
+from jumper_warp.rl.torch.ppo import Ppo
 from toy_task import SMALL, PushTask, fill, free_port, local_order, update_half
 
 PLAIN = PpoCfg(

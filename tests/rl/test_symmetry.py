@@ -12,7 +12,7 @@ from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import Symmetry, expand_layers, mirror_map
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import task_to_json

@@ -5,7 +5,6 @@ import os
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,6 +14,7 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.logger import Scores
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
@@ -293,12 +293,12 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
 )
 def test_checkpoint_has_the_mean_score_once_half_of_the_worlds_are_at_the_last_level(fractions, score):
     levels = {f"Curriculum/fraction_at_level_{i}": fraction for i, fraction in enumerate(fractions)}
-    run = SimpleNamespace(cfg=TrainCfg(task="t"), _scores=[])
+    scores = Scores("Metrics/success")
     for success in (0.9, math.nan, 0.7):
-        run.metrics = {"Metrics/success": success, **levels}
-        TrainingRun._add_score(run)
-    assert TrainingRun._score(run) == (score and pytest.approx(score))
-    assert TrainingRun._score(run) is None  # no value since the checkpoint before
+        scores.add({"Metrics/success": success, **levels})
+    assert scores.mean() == (score and pytest.approx(score))
+    scores.clear()
+    assert scores.mean() is None  # no value since the checkpoint before
 
 
 def test_saved_score_is_the_mean_of_the_logged_metric_since_the_checkpoint_before(tmp_path):

@@ -9,7 +9,7 @@ import torch
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.torch.ppo import Ppo
 from ppo_oracle import reference_losses
 from toy_task import PushTask, fill
 

@@ -11,13 +11,14 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.learner import Learner
+from jumper_warp.rl.torch.ppo import Ppo
 
 
-def make_ppo(env: VecEnv, cfg: PpoCfg) -> Ppo:
-    """Return the PPO trainer of an environment: `FusedPpo` if `use_fused` returns True, else `Ppo`.
+def make_ppo(env: VecEnv, cfg: PpoCfg) -> Learner:
+    """Return the PPO learner of an environment: `FusedPpo` if `use_fused` returns True, else `Ppo`.
 
-    Raises InputError as `Ppo`.
+    Raises InputError as `Learner`.
     """
     if not use_fused(cfg, env.device):
         return Ppo(env, cfg)

@@ -11,7 +11,7 @@ from jumper_warp.kernels.attitude.commands import TurnRanges
 from jumper_warp.kernels.attitude.start_states import AttitudeSettings
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_positive, check_probabilities
+from jumper_warp.utils.checks import check_positive, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
 
 
@@ -36,6 +36,7 @@ class TurnCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError unless 0 <= lower <= upper <= 180 deg and the probability is in 0 to 1."""
+        check_types("turn", self)
         if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
         check_probabilities("turn", self, "body_axis_probability")

@@ -16,7 +16,7 @@ from jumper_warp.kernels.jump.start_states import ResetRanges
 from jumper_warp.kernels.jump.state import vec_start_modes
 from jumper_warp.tasks.cfg import Command
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_positive, check_probabilities
+from jumper_warp.utils.checks import check_positive, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
 
 JUMP_COMMAND = Command(
@@ -52,6 +52,7 @@ class GroundCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if a probability or length is out of range, or a pair reversed or not positive."""
+        check_types("ground", self)
         if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
             raise InputError(f"ground probabilities must be >= 0, in sum at most 1, got {self.platform}, {self.block}")
         for name, value in vars(self).items():
@@ -87,6 +88,7 @@ class Level:
 
     def __post_init__(self) -> None:
         """Raise InputError if a range is reversed or not finite, or a height or probability is out of range."""
+        check_types("level", self)
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
@@ -127,6 +129,7 @@ class StartProbability:
 
     def __post_init__(self) -> None:
         """Raise InputError if a probability is negative, or they do not add up to 1."""
+        check_types("start_probability", self)
         values = tuple(vars(self).values())
         if not min(values) >= 0.0 or not abs(sum(values) - 1.0) < 1.0e-6:
             raise InputError(f"start_probability must be >= 0 and add up to 1, got {vars(self)}")

@@ -14,7 +14,7 @@ from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.cfg import Command, TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_probabilities
+from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ class CommandCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if a range shrinks or is not positive, or a count, time or probability is out of range."""
+        check_types("command", self)
         check_bounds("command", self, dict.fromkeys(("first_range", "last_range"), (-100.0, 100.0, "m/s, rad/s")))
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")

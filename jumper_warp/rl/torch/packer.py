@@ -1,0 +1,140 @@
+"""Conversion of a rollout to training samples with values, advantages and returns, by PyTorch functions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from jumper_warp.envs.vec_env import sanitise
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.mirror import MirrorMap
+from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
+from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, gae
+from jumper_warp.rl.torch.rollout import RolloutBuffer
+
+CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensors stay in its caches
+
+
+class Estimates(NamedTuple):
+    """Values, advantages and returns of all steps of a rollout; batch = num_steps · num_envs, time-major."""
+
+    value: torch.Tensor  # (batch,) the critic's output [standard deviations of the return]
+    advantage: torch.Tensor  # (batch,) in scaled rewards
+    target: torch.Tensor  # (batch,) returns in scaled rewards
+    moments: RolloutMoments  # moments over this rank's samples
+
+
+class Scalings(NamedTuple):
+    """Means and standard deviations that normalise observations and returns."""
+
+    obs: Scaling  # (num_obs,)
+    critic_obs: Scaling  # (num_critic_obs,)
+    value: Scaling  # () for the return
+
+
+class BatchPacker:
+    """Converter of a rollout to PPO's training samples, with advantages and returns, one per row of `rows`."""
+
+    def __init__(
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
+        obs_mirror: MirrorMap | None = None,
+    ) -> None:  # fmt: skip
+        """Allocate memory for the training samples of a rollout.
+
+        flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics.
+        """
+        self._obs_mirror = obs_mirror
+        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic
+        steps, worlds, num_actions = rollout.action.shape
+        self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
+        self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
+        """Packed samples, (steps · worlds, columns of `layout`), time-major."""
+        self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
+        self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
+
+    @torch.no_grad()
+    def pack(self) -> None:
+        """Compute advantages and returns, write the samples to `rows`, and update the normalisation statistics."""
+        model = self._model
+        scalings = self._scalings()  # those that actor and critic used in the rollout
+        estimates = self._estimates(scalings)
+        moments = RolloutMoments(*all_reduce_moments(estimates.moments))
+        obs_moments = moments.obs
+        if self._obs_mirror is not None:
+            symmetric = self._obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
+            obs_moments = Moments(*symmetric, obs_moments.count)
+        model.obs_moments.update_from_moments(obs_moments)
+        model.critic_moments.update_from_moments(moments.critic_obs)
+        if self._cfg.normalise_value:
+            model.value_moments.update_from_moments(moments.target)
+        mean, var, count = moments.advantage
+        advantage_scaling = Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
+        self._pack(scalings, estimates, advantage_scaling)
+        self.old_log_std.copy_(self._rollout.log_std)
+
+    def _scalings(self) -> Scalings:
+        """Return the current mean and standard deviation of observations and values."""
+        model = self._model
+        return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
+
+    def _estimates(self, scalings: Scalings) -> Estimates:
+        """Compute values, advantages and returns of the rollout."""
+        return compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
+
+    def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
+        """Write the rollout's samples with values, advantages and returns to `rows`; arguments: see `write_rows`."""
+        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
+        write_rows(
+            self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
+            self._chunk_size,
+        )  # fmt: skip
+
+
+def compute_values_and_gae(
+    buffer: RolloutBuffer, critic: Layers, scalings: Scalings, cfg: PpoCfg, chunk_size: int | None
+) -> Estimates:
+    """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
+
+    A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
+    """
+    columns = critic.weights[0].shape[1]
+
+    def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
+        """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
+        scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
+        heads = [critic.forward(scaling.features(sanitise(chunk), columns))[0] for chunk in chunks]
+        return torch.cat(heads).view(critic_obs.shape[:2])
+
+    head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
+    value, final_value = scalings.value.denormalise(head), scalings.value.denormalise(final_head)
+    reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
+    advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
+    samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
+    moments = RolloutMoments(*(Moments.from_samples(x, chunk_size) for x in samples))
+    return Estimates(head[:-1].flatten(), advantage, target, moments)
+
+
+def write_rows(
+    rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
+    advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
+) -> None:  # fmt: skip
+    """Normalise a rollout's training samples, and write them to `rows` (batch, columns of `layout`), one per row.
+
+    chunk_size: samples packed at a time (None: all).
+    scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.
+    """
+    target = estimates.target if target_scaling is None else target_scaling.normalise(estimates.target)
+    steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
+    pieces = [rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
+    for out, obs, critic_obs, action, mean, *estimated in zip(*[_chunks(x, chunk_size) for x in pieces], strict=True):
+        features = scalings.obs.features(obs, layout.num_obs)
+        critic_features = scalings.critic_obs.features(critic_obs, layout.num_critic_obs)
+        log_prob = gaussian_log_prob(action, mean, buffer.log_std)
+        out.copy_(layout.pack(Batch(features, critic_features, action, mean, log_prob, *estimated)))
+
+
+def _chunks(x: torch.Tensor, chunk_size: int | None) -> tuple[torch.Tensor, ...]:
+    """Split x (batch, ...) into views of `chunk_size` rows, the last with the remainder; None: one view of all rows."""
+    return x.split(chunk_size or x.shape[0])

@@ -1,0 +1,57 @@
+"""Readers of files that a user supplies refuse damaged ones in one line, without waiting or filling the memory."""
+
+import os
+
+import numpy as np
+import pytest
+
+from jumper_warp.identification.motions import load_motions
+from jumper_warp.policies.runs import load_policy
+from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.utils.dumps import load_dump
+from jumper_warp.utils.errors import InputError
+
+READERS = {
+    "dump.npz": load_dump,
+    "motion.npz": lambda path: load_motions([path]),
+    "motion.csv": lambda path: load_motions([path]),
+    "motion.parquet": lambda path: load_motions([path]),
+    "robot.json": load_overlay,
+    "policy/manifest.json": lambda path: load_policy(path.parent),
+}
+
+
+@pytest.fixture(params=READERS)
+def damaged(request, tmp_path):
+    """Path of a file, in an existing folder, and a function without arguments that reads it."""
+    path = tmp_path / request.param
+    path.parent.mkdir(exist_ok=True)
+    return path, lambda: READERS[request.param](path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 100, b"PK\x03\x04 no archive", b"\xff\xfe{", b"[" * 5000, b"{}", b"1,2\n"]
+)
+def test_damaged_content_is_refused_in_one_line(damaged, content):
+    path, read = damaged
+    path.write_bytes(content)
+    with pytest.raises(InputError) as refusal:
+        read()
+    assert path.name in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: os.symlink("/dev/zero", path)])
+def test_file_that_is_not_regular_is_refused(damaged, make):
+    path, read = damaged
+    make(path)
+    with pytest.raises(InputError, match="not a regular file"):
+        read()
+
+
+@pytest.mark.parametrize("name", ["dump.npz", "motion.npz"])
+def test_archive_is_refused_before_it_is_unpacked_to_gigabytes(name, tmp_path):
+    path = tmp_path / name
+    np.savez_compressed(path, header=np.zeros(2**30 + 1, dtype=np.uint8))
+    assert path.stat().st_size < 2**21
+    with pytest.raises(InputError, match="MiB"):
+        READERS[name](path)
