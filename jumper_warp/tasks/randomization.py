@@ -9,7 +9,7 @@ from typing import Any, Literal
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.bounds import check_range
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_probabilities
+from jumper_warp.utils.checks import check_probabilities, check_types
 
 Range = tuple[float, float] | None  # (lower, upper), or None: off
 NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not randomised
@@ -73,7 +73,8 @@ class RandomizationCfg:
     """When parameters other than pushes are sampled: once at startup, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a range is reversed, not finite or out of bounds, or a probability is not in 0 to 1."""
+        """Raise InputError for a field of another type, a reversed range, or one out of bounds."""
+        check_types("randomisation", self)
         for name, value in vars(self).items():
             if isinstance(value, tuple):
                 check_range(name, value)
