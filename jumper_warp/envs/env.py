@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
+import newton
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import ArrayLike
 
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
@@ -16,10 +18,8 @@ from jumper_warp.envs.arrays import (
     checked_action,
     checked_commands,
     checked_mask,
-    checked_tasks,
     checked_values,
     checked_worlds,
-    prepared_tasks,
 )
 from jumper_warp.envs.stages import Stages, WorldSlice, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
@@ -31,10 +31,10 @@ from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.dynamics import WorldRange, advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
-from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg
+from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg, checked_tasks
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
-from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
+from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of, with_own_ranges
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_flags, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
@@ -44,6 +44,7 @@ from jumper_warp.utils.runtime import init_warp
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
 
+Values = ArrayLike | torch.Tensor  # Numbers, lists, arrays or tensors
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
 
@@ -87,7 +88,7 @@ class Env(Stages):
         noise: bool = True,
         auto_reset: bool = True,
         visuals: bool = False,
-        ground: Any = "plane",
+        ground: str | newton.Heightfield | None = "plane",
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
@@ -118,7 +119,9 @@ class Env(Stages):
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         if robot is not None and not isinstance(robot, RobotOverlay):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
-        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
+        own = [with_own_ranges(each, robot) if randomize else each for each in tasks]
+        run = [each.in_conditions(randomize=randomize, noise=noise, ground_may_vary=may_vary) for each in own]
+        self._draws_ground = any(each.draws_ground for each in run)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         init_warp()
@@ -159,7 +162,9 @@ class Env(Stages):
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
     @locked
-    def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def reset(
+        self, seed: int | None = None, *, worlds: Values | None = None
+    ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return (observations by group, extras), extras being empty.
 
         seed: restart all random streams and the curriculum as in a new environment with this seed; graphs captured
@@ -279,7 +284,7 @@ class Env(Stages):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill!r:.40}")
 
     @locked
-    def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
+    def evaluation_reset(self, commands: Values, headings: Values = 0.0, worlds: Values | None = None) -> None:
         """Begin episodes with given commands in the default pose and first task; `step` resets no world until `reset`.
 
         commands: one row a world or one for all, columns as in the `labels` of `Command`; headings [rad]:
@@ -288,7 +293,7 @@ class Env(Stages):
         """
         n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
-        headings = self._array(checked_values(headings, (n,), "headings"))
+        yaws = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
@@ -298,16 +303,16 @@ class Env(Stages):
         self._advance_rng(mask)
         self._restore_first_task(self._part(), mask)
         self._randomize(self._part(), mask)
-        inputs = [mask, headings, self._scene, self._settings, self.episodes.skill, self.robot]
+        inputs = [mask, yaws, self._scene, self._settings, self.episodes.skill, self.robot]
         self._launch(default_pose_kernel, n, inputs)
         self._clear_history(self._part(), mask)
-        self._set_commands(mask, 1, values, headings)
+        self._set_commands(mask, 1, values, yaws)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
         self.episodes.done.zero_()
 
     @locked
-    def command(self, commands: Any, worlds: Any = None) -> None:
+    def command(self, commands: Values, worlds: Values | None = None) -> None:
         """Set the tasks' commands (such as goals or velocities) within running episodes, and update `obs`.
 
         commands: as in `evaluation_reset`, relative to the current base position and yaw; worlds: (num_envs,) bool, by
@@ -318,7 +323,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=1)
 
     @locked
-    def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
+    def request(self, skill: int, worlds: Values | None = None, commands: Values | None = None) -> None:
         """Request that worlds switch to another skill as soon as the condition of a handover holds.
 
         skill: index of the task. worlds: (num_envs,) bool, by default all. commands: as in `evaluation_reset`, set at

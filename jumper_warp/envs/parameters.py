@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -13,6 +11,7 @@ from jumper_warp.sim.dynamics import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
+from jumper_warp.utils.kernels import KernelStruct
 
 MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
@@ -27,7 +26,7 @@ NOMINAL = {
 
 def robot_parameters(
     sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array, moves: RangeMoves | None = None
-) -> Any:  # fmt: skip
+) -> KernelStruct:  # fmt: skip
     """Return the arrays of robot parameters that domain randomisation writes, as views of a simulation's arrays.
 
     The model's current values become the nominal ones. skill: (num_worlds,) int, index in `tasks` of each world's

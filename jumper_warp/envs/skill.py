@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,11 +21,13 @@ from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.copying import Struct
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.dumps import NonFiniteValue
-from jumper_warp.utils.kernels import Kernel, content_hash, records
+from jumper_warp.utils.kernels import Kernel, KernelStruct, content_hash, records
 from jumper_warp.utils.threads import locked
 
+T = TypeVar("T")
 _KERNELS: dict[tuple, Kernel] = {}
 
 
@@ -37,7 +39,8 @@ class TaskRuntime:
     """
 
     def __init__(
-        self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any, slices: int = 1
+        self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: wp.DeviceLike,
+        slices: int = 1,
     ) -> None:  # fmt: skip
         """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`.
 
@@ -58,7 +61,7 @@ class TaskRuntime:
         self._allocate_observations(substeps)
         self._allocate_non_finite(slices)
 
-    def _counters(self) -> Any:
+    def _counters(self) -> KernelStruct:
         """Return the counters of episode statistics for the kernels, all 0."""
         n, task, counters = self.num_envs, self.task, Counters()
         allocate(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
@@ -67,7 +70,7 @@ class TaskRuntime:
         allocate(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
-    def _structs(self, values: list, kind: Any = None) -> wp.array:
+    def _structs(self, values: list, kind: Struct | None = None) -> wp.array:
         """Return kernel structs (settings or curriculum levels) as a Warp array of type `kind`.
 
         If there are none, it has one unused `NoSettings`.
@@ -154,7 +157,7 @@ class TaskRuntime:
             first += self.num_envs * width
         return views
 
-    def settings_of_skill(self) -> Any:
+    def settings_of_skill(self) -> KernelStruct:
         """Return the task's constants as a kernel struct: action scale, command filter, collision margins."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
@@ -248,7 +251,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     }
 
 
-def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
+def _kernel(make: Callable[[T], Kernel], source: T, *key_parts: object) -> Kernel:
     """Return the kernel that `make` builds from `source`, built once and cached.
 
     Key: `make` and key_parts, all parts of source that the kernel depends on, with the code of their functions.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -32,7 +32,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
 from jumper_warp.utils.copying import Uncopied
-from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
@@ -59,7 +59,7 @@ class WorldSlice(NamedTuple):
 
     first: int
     count: int
-    episode: Any  # The kernels' `EpisodeArrays` that begin at `first`
+    episode: KernelStruct  # The kernels' `EpisodeArrays` that begin at `first`
 
 
 class Stages(Uncopied):

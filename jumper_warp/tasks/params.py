@@ -78,7 +78,7 @@ class TaskParams:
 class ParamArrays:
     """Device array of the parameters of all terms of a task; values can change while captured CUDA graphs read them."""
 
-    def __init__(self, params: TaskParams, device: Any) -> None:
+    def __init__(self, params: TaskParams, device: wp.DeviceLike) -> None:
         """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""
         self.params = params
         self._numbers = list(params.values)  # `values` before their conversion to float32

@@ -10,6 +10,7 @@ from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.bounds import check_range
 from jumper_warp.tasks.terms import EventTerm
 from jumper_warp.utils.checks import check_probabilities, check_types
+from jumper_warp.utils.kernels import Function
 
 Range = tuple[float, float] | None  # (lower, upper), or None: off
 NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not randomised
@@ -124,7 +125,7 @@ class RandomizationCfg:
         """Return the events that sample robot parameters from the ranges that are not None; numbers are in SI units."""
         terms = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
+        def add(func: Function, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
                 terms.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **numbers))

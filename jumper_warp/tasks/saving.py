@@ -37,7 +37,7 @@ class TaskError(InputError):
 # ---------------------------------------------------------------------- to JSON
 
 
-def name_of(definition: Any) -> str:
+def name_of(definition: object) -> str:
     """Return the name `module:name` under which a Warp function, a struct or a class is saved.
 
     For a file that runs as a program, the module is the file's stem, under which `--task-module` loads it.
@@ -51,7 +51,7 @@ def name_of(definition: Any) -> str:
     return f"{module}:{name}"
 
 
-def json_value(value: Any) -> Any:
+def json_value(value: object) -> Any:
     """Return a part of a task as JSON data: dicts with "type", lists, scalars. Raises TaskError: it cannot be saved."""
     if isinstance(value, Term):
         options = {key: json_value(option) for key, option in value.options.items()}
@@ -82,7 +82,7 @@ def handover_to_json(handover: Handover) -> dict[str, Any]:
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Return a short description of any JSON value for messages: the scalar itself, or its type."""
     if value is None or isinstance(value, bool | int | float | str):
         return f"{value!r:.60}" if not isinstance(value, int) or abs(value) < 10**18 else "a huge integer"
@@ -107,7 +107,7 @@ class Finder:
         """Set the modules to search: the project's, `modules` (the user's loaded ones), and their neighbours."""
         self.modules = {module.__name__: module for module in with_neighbours(list(modules))}
 
-    def __call__(self, name: Any, where: str) -> Any:
+    def __call__(self, name: object, where: str) -> Any:
         """Return the Warp function, struct, dataclass or subclass of `Term` called `name`; where: place for messages.
 
         Raises TaskError: there is none.
@@ -129,7 +129,7 @@ class Finder:
         return value
 
 
-def check_version(saved: Any) -> None:
+def check_version(saved: object) -> None:
     """Raise TaskError unless `saved` is a task's JSON object in the current version of the format, VERSION."""
     if not isinstance(saved, dict):
         raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
