@@ -24,9 +24,12 @@ class LegThreadReverse:
 
         every: physics steps between rows of a trajectory.
         """
-        self._dynamics, self._modules = dynamics, dynamics.modules
-        self._device, self._num = dynamics.model.device, dynamics.model.world_count
-        module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
+        self._dynamics = dynamics
+        self._modules = dynamics.modules
+        self._device = dynamics.model.device
+        self._num = dynamics.model.world_count
+        module = self._modules.leg_record
+        shape = {"dtype": dynamics.real, "device": self._device}
         self._record = module.LegRecord()
         entries = SPAN * (every + 1)
         self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
@@ -40,8 +43,11 @@ class LegThreadReverse:
         num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the gradient of the loss w.r.t.
         the rollout's.
         """
-        robot, record, num = self._dynamics.robot, self._record, self._num
-        legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint
+        robot = self._dynamics.robot
+        record = self._record
+        num = self._num
+        legs = self._modules.rollout_legs_adjoint
+        constants = self._modules.constants_adjoint
         timing, *actuated, rows = motion
         turns = 8 if self._device.is_cuda else 1  # a GPU warp holds eight worlds, or eight steps of one world
         threads = -(-num // 8) * 8

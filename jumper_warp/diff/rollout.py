@@ -125,8 +125,12 @@ class Rollout(Uncopied):
         self.dynamics = JumperDynamics(
             model, description=description, max_sweeps=MAX_SWEEPS, tolerance=tolerance, double=double
         )
-        self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
-        self.dt, self.substeps, self.every = dt, substeps, every
+        self.num_worlds = model.world_count
+        self.device = model.device
+        self.real = self.dynamics.real
+        self.dt = dt
+        self.substeps = substeps
+        self.every = every
         self._actuation = self._make_actuation(motors or jumping_motors(), command_filter)
         self.motors = self._actuation.motors  # The kernels' `MotorArrays`, whose arrays are among the parameters
         self.parameters: dict[str, wp.array] = {
@@ -155,7 +159,8 @@ class Rollout(Uncopied):
 
         The latency is zero.
         """
-        modules, n = self.dynamics.modules, self.num_worlds
+        modules = self.dynamics.modules
+        n = self.num_worlds
         actuation = modules.trajectory.Actuation()
         actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
         actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
@@ -288,7 +293,8 @@ class Rollout(Uncopied):
         `parameters`, and `geometry` (4, 10, num_worlds) w.r.t. the legs' lengths. The gradient w.r.t. the initial
         quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
-        n, modules = self.num_worlds, self.dynamics.modules
+        n = self.num_worlds
+        modules = self.dynamics.modules
         commands = trajectory.commands
         count = commands.target.shape[0]
         rows_of = (count * self.substeps // self.every + 1, 19, n)
@@ -349,7 +355,8 @@ class Rollout(Uncopied):
 
         gradient: (GRADIENT_ROWS, num_worlds); views are shaped as `parameters` and `geometry`.
         """
-        names, first = {}, 0
+        names = {}
+        first = 0
         for name, array in self.parameters.items():
             count = 1 if array.ndim == 1 else array.shape[0]
             names[name] = gradient[first : first + count] if array.ndim > 1 else gradient[first]
@@ -364,7 +371,8 @@ class Rollout(Uncopied):
 
     def _rows(self, count: int) -> KernelStruct:
         """Allocate the arrays that record a rollout of `count` policy steps, uninitialised."""
-        steps, n = count * self.substeps, self.num_worlds
+        steps = count * self.substeps
+        n = self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)

@@ -34,14 +34,20 @@ def robot_arrays(sim: Simulation, step_dt: float) -> KernelStruct:
 
     step_dt [s]: policy step.
     """
-    n, device, robot = sim.num_worlds, sim.device, RobotArrays()
-    robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
-    robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
+    n = sim.num_worlds
+    device = sim.device
+    robot = RobotArrays()
+    robot.joint_q = sim.state.joint_q
+    robot.joint_qd = sim.state.joint_qd
+    robot.body_f = sim.state.body_f
+    robot.body_com = sim.model.body_com
+    robot.gravity = sim.model.gravity
     robot.diverged = sim.dynamics.work.diverged
     robot.impulse = sim.dynamics.work.impulse
     robot.paw_force = sim.paw_force
     robot.peak_force = sim.peak_paw_force
-    robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
+    robot.torque = sim.torque
+    robot.joint_offset = sim.motors.offset
     motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")
     allocate(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
     allocate(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
@@ -59,7 +65,9 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
     skill: (num_envs,) index of each world's task.
     """
     episode = EpisodeArrays()
-    episode.seed, episode.purpose, episode.skill = seed, PURPOSES.index(stream), skill
+    episode.seed = seed
+    episode.purpose = PURPOSES.index(stream)
+    episode.skill = skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
               "streak")  # fmt: skip
     allocate(episode, ("pending_command",), num_envs, wp.vec4, device)
@@ -81,14 +89,18 @@ def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: wp.Dev
     allocate(delays, ("target_history",), (RING, 12, num_envs), float, device)
     allocate(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
     allocate(delays, ("switch_step",), num_envs, int, device)
-    delays.steps, delays.substeps = latency, substeps
+    delays.steps = latency
+    delays.substeps = substeps
     return delays
 
 
 def scene_of(sim: Simulation) -> KernelStruct:
     """Return the kernels' `Scene` (ground and robot constants) of a simulation."""
-    scene, robot = Scene(), sim.dynamics.robot
-    scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
+    scene = Scene()
+    robot = sim.dynamics.robot
+    scene.geometry = robot.geometry
+    scene.ground = robot.ground
+    scene.reference_q = sim.model.joint_q
     return scene
 
 
@@ -183,7 +195,9 @@ def checked_commands(commands: object, mask: np.ndarray, tasks: Sequence[TaskCfg
     mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
-    array, n, errors = as_float32(commands, "commands"), len(mask), []
+    array = as_float32(commands, "commands")
+    n = len(mask)
+    errors = []
     for task in tasks:
         try:
             task.command.check(array, task.name, mask > 0.0)

@@ -108,14 +108,22 @@ class Env(Stages):
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
         """
-        num_envs, refine, seed = check_count("num_envs", num_envs), check_count("refine", refine), check_seed(seed)
+        num_envs = check_count("num_envs", num_envs)
+        refine = check_count("refine", refine)
+        seed = check_seed(seed)
         check_flags(randomize=randomize, noise=noise, auto_reset=auto_reset)
         if stream not in PURPOSES:
             raise InputError(f"stream must be one of {', '.join(PURPOSES)}, got {stream!r:.40}")
         self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
-        self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self.overlay, self.conditions = tuple(handovers), robot, (bool(randomize), bool(noise))
+        self.task = tasks[0]
+        self.tasks = tasks
+        self.num_envs = num_envs
+        self.seed = seed
+        self.auto_reset = auto_reset
+        self.handovers = tuple(handovers)
+        self.overlay = robot
+        self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         if robot is not None and not isinstance(robot, RobotOverlay):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
@@ -140,8 +148,12 @@ class Env(Stages):
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
         if self._draws_ground:
             self.sim.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
-        self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
-        self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
+        self.physics_dt = self.sim.dt
+        self.step_dt = self.sim.dt * self.sim.substeps
+        self._ends_episodes = True
+        self._started = False
+        self._compiled = False
+        self._graphs = {}
         self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
@@ -150,11 +162,16 @@ class Env(Stages):
 
         Observations and reward terms are the first task's.
         """
-        self.num_actions, self.actions = 12, wp.to_torch(self._action)
-        self.action, first = self.actions[0], self.skills[0]
-        self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
-        self.final_obs, self.final_critic_obs = first.final_obs["actor"], first.final_obs["critic"]
-        self.num_obs, self.num_critic_obs = self.obs.shape[1], self.critic_obs.shape[1]
+        self.num_actions = 12
+        self.actions = wp.to_torch(self._action)
+        self.action = self.actions[0]
+        first = self.skills[0]
+        self.obs = first.obs["actor"]
+        self.critic_obs = first.obs["critic"]
+        self.final_obs = first.final_obs["actor"]
+        self.final_critic_obs = first.final_obs["critic"]
+        self.num_obs = self.obs.shape[1]
+        self.num_critic_obs = self.critic_obs.shape[1]
         terms = wp.to_torch(first.term_value)
         self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
         names = ("reward", "done", "timeout", "terminated", "truncated")
@@ -291,7 +308,8 @@ class Env(Stages):
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
         Raises InputError (a ValueError): values of another shape, out of bounds or, other than policy steps, infinite.
         """
-        n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
+        n = self.num_envs
+        chosen = checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
         yaws = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(chosen)
@@ -331,7 +349,8 @@ class Env(Stages):
         Raises InputError (a ValueError): no such skill, or commands of another shape, out of bounds or not finite.
         """
         self._check_skill(skill)
-        mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
+        mask = checked_mask(worlds, self.num_envs)
+        values = np.zeros((self.num_envs, 4), dtype=np.float32)
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
@@ -361,8 +380,10 @@ class Env(Stages):
     @locked
     def snapshot(self) -> Snapshot:
         """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
-        sim, n = self.sim, self.num_envs
-        past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
+        sim = self.sim
+        n = self.num_envs
+        past = wp.to_torch(self.delays.target_history)
+        step_count = wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
         dynamics = sim.dynamics
         return Snapshot(

@@ -32,7 +32,9 @@ def robot_parameters(
     The model's current values become the nominal ones. skill: (num_worlds,) int, index in `tasks` of each world's
     active task. moves: differences of the robot from the described one, None for the described one.
     """
-    model, n, device = sim.model, sim.num_worlds, sim.device
+    model = sim.model
+    n = sim.num_worlds
+    device = sim.device
     robot = RobotParameters()
     for name in MODEL:
         setattr(robot, name, getattr(model, name))
@@ -43,7 +45,9 @@ def robot_parameters(
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
     robot.static_ratio = sim.dynamics.static_friction_ratio
-    robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
+    robot.motors = sim.motors
+    robot.physics_dt = sim.dt
+    robot.skill = skill
     overlay = sim.robot
     latency = 0 if overlay is None else round(float(overlay.latency[0, 0]) / sim.dt)
     robot.latency = wp.full(n, latency, dtype=int, device=device)
@@ -68,5 +72,6 @@ def robot_parameters(
     moves = RangeMoves() if moves is None else moves
     robot.motor_friction_move = wp.array(np.array(moves.motor_friction), dtype=float, device=device)
     robot.friction_move = wp.vec2(moves.dynamic_friction, moves.static_friction)
-    robot.latency_move, robot.zero_latency = 1.0e-3 * moves.latency, 1.0e-3 * moves.zero_latency
+    robot.latency_move = 1.0e-3 * moves.latency
+    robot.zero_latency = 1.0e-3 * moves.zero_latency
     return robot

@@ -28,7 +28,8 @@ class Sb3VecEnv(VecEnv):
         """
         if envs.tensors or envs.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise InputError("Stable-Baselines3 needs arrays and autoreset_mode 'SameStep'")
-        self.envs, self._actions = envs, np.zeros(0)
+        self.envs = envs
+        self._actions = np.zeros(0)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:

@@ -84,7 +84,9 @@ class Stages(Uncopied):
 
         moves: differences of the robot from the described one.
         """
-        n, device, sim = self.num_envs, self.wp_device, self.sim
+        n = self.num_envs
+        device = self.wp_device
+        sim = self.sim
         wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
@@ -92,7 +94,8 @@ class Stages(Uncopied):
             TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
         ]
         self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
-        self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
+        self.robot = robot_arrays(sim, self.step_dt)
+        self._scene = scene_of(sim)
         self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
@@ -132,7 +135,8 @@ class Stages(Uncopied):
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:
             setattr(env, name, getattr(self.episodes, name))
-        env.first, env.slice = worlds.first, self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
+        env.first = worlds.first
+        env.slice = self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
         return WorldSlice(*worlds, env)
 
     def _apply_actions(self, part: WorldSlice) -> None:
@@ -220,7 +224,8 @@ class Stages(Uncopied):
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
             if due:
                 parallel = self.wp_device.is_cuda and any(slot.parallel for slot in due.values())
-                first, lanes = min(due), events.LANES if parallel else 1
+                first = min(due)
+                lanes = events.LANES if parallel else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
                     [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values,
@@ -237,7 +242,8 @@ class Stages(Uncopied):
 
     def _clear_results(self, mask: wp.array) -> None:
         """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""
-        begun, episodes = wp.to_torch(mask) != 0.0, self.episodes
+        begun = wp.to_torch(mask) != 0.0
+        episodes = self.episodes
         for name in ("reward", "done", "timeout", "terminated", "truncated", "termination"):
             wp.to_torch(getattr(episodes, name)).masked_fill_(begun, -1 if name == "termination" else 0)
         for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):

@@ -15,7 +15,7 @@ from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_count, check_filter_speed
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
 
@@ -125,9 +125,8 @@ def motor_arrays(
 
     Arrays are (12, num_worlds), without sensor offsets. module: `jumper_warp.kernels.actuation.motors` in either
     precision. robot: factors on gains and torque limits, speeds and sensor offsets of one robot (N = 1) or of every
-    world (N = num_worlds). Raises InputError for less than one world.
+    world (N = num_worlds).
     """
-    num_worlds = check_count("num_worlds", num_worlds)
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]

@@ -281,7 +281,8 @@ class JumperDynamics:
 
         The reference pose is the model's `joint_q`. Returned as the kernels' `Workspace`.
         """
-        scalar, n = self.modules.scalar, self.num_worlds
+        scalar = self.modules.scalar
+        n = self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
             (("impulse", "contact_force"), (4, n), scalar.vec3),
@@ -297,7 +298,8 @@ class JumperDynamics:
 
     def step_record(self, steps: int) -> KernelStruct:
         """Allocate zeroed arrays in which backpropagation records up to `steps` time steps that it recomputes."""
-        record, n = self.modules.multipliers.StepRecord(), self.num_worlds
+        record = self.modules.multipliers.StepRecord()
+        n = self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
             shape += () if name in ("base", "inverse") else (4,)
@@ -342,7 +344,8 @@ class JumperDynamics:
 
         mask: (num_worlds,) float, not 0 in worlds to update. worlds: range in which the mask is read, by default all.
         """
-        m, (first, count) = self.model, worlds or (0, self.num_worlds)
+        m = self.model
+        first, count = worlds or (0, self.num_worlds)
         self._launch(
             self.modules.parameters.repack_kernel,
             (count, 25),

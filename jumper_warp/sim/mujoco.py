@@ -132,8 +132,10 @@ class MujocoDynamics(JumperDynamics):
 
     def _step(self, state: State, motors: KernelStruct, target: wp.array, dt: float, restart: bool) -> None:
         """Advance one physics step towards motor targets [rad], (12, num_worlds); restart: reset peak forces."""
-        q, qd, joint_f = state.joint_q, state.joint_qd, self._control.joint_f
-        work, each_motor = self.work, (12, self.num_worlds)
+        q, qd = state.joint_q, state.joint_qd
+        joint_f = self._control.joint_f
+        work = self.work
+        each_motor = (12, self.num_worlds)
         self._launch_on(motor_torque_kernel, each_motor, [target, q, qd, COORDS, DOFS, motors], [joint_f])
         self._launch_on(motor_values_kernel, each_motor, [joint_f], [work.torque])
         self._launch_on(passive_torque_kernel, (self.num_worlds, 4), [q, qd, *self._passive], [joint_f])

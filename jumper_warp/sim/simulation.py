@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import newton
 import numpy as np
@@ -152,7 +152,8 @@ class Simulation(Uncopied):
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
-        num_worlds, substeps = check_count("num_worlds", num_worlds), check_step(dt, substeps)
+        num_worlds = check_count("num_worlds", num_worlds)
+        substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
         self.robot = values = _values_of(robot, friction)
         self.model = build_model(
@@ -201,10 +202,12 @@ class Simulation(Uncopied):
 
     def _make_arrays(self) -> None:
         """Allocate state, control, targets, standing pose, reset mask and readout arrays."""
-        self.state, self.control = self.model.state(), self.model.control()
+        self.state = self.model.state()
+        self.control = self.model.control()
         standing = motor_values(self.model.joint_q.numpy().reshape(self.num_worlds, -1)[:, 7:])
         self._standing = wp.array(standing.T, dtype=float, device=self.device)
-        self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
+        self.target = wp.clone(self._standing)
+        self._safe_target = wp.clone(self._standing)
         self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # last entry: no world
         self._base_velocity = wp.zeros(self.num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
@@ -216,8 +219,9 @@ class Simulation(Uncopied):
 
         Raises InputError: another shape, or not finite.
         """
-        array: Any = angles
-        values = np.asarray(array.detach().cpu() if hasattr(array, "detach") else array, dtype=np.float32)
+        if hasattr(angles, "detach"):
+            angles = cast("torch.Tensor", angles).detach().cpu()
+        values = np.asarray(angles, dtype=np.float32)
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
         if not np.isfinite(values).all():
@@ -252,20 +256,13 @@ class Simulation(Uncopied):
         if mask is None:
             self._mask.fill_(True)
             return
-        array: Any = mask
-        is_tensor = hasattr(mask, "is_cuda")
-        try:
-            array = array if is_tensor or isinstance(array, wp.array) else np.asarray(array)
-            dtype, shape = getattr(array.dtype, "__name__", str(array.dtype)), tuple(array.shape)
-        except ValueError:  # lists of different lengths
-            dtype, shape = "lists", "several lengths"
-        if dtype not in ("bool", "torch.bool") or shape != (self.num_worlds,):
-            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {dtype} of shape {shape}")
-        if is_tensor:
-            array = wp.from_torch(cast("torch.Tensor", array).contiguous())
-        elif isinstance(array, np.ndarray):
-            array = wp.array(array, dtype=wp.bool, device=self.device)
-        wp.copy(self._mask, array, count=self.num_worlds)
+        if hasattr(mask, "is_cuda"):
+            mask = wp.from_torch(cast("torch.Tensor", mask).contiguous())
+        elif not isinstance(mask, wp.array):
+            mask = wp.array(np.asarray(mask), device=self.device)
+        if mask.dtype is not wp.bool or mask.shape != (self.num_worlds,):
+            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {mask.dtype} {mask.shape}")
+        wp.copy(self._mask, mask, count=self.num_worlds)
 
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once, with measured angles (true angle + `motors.offset`).
@@ -359,13 +356,14 @@ class Simulation(Uncopied):
         They are computed from the joint coordinates; the state does not change. pose: position [m] and quaternion
         (xyzw); twist: velocity of the COM [m/s] and angular velocity [rad/s]. Waits for the device.
         """
-        state = self._links = self._links or self.model.state()
+        if self._links is None:
+            self._links = self.model.state()
+        state = self._links
         wp.copy(state.joint_q, self.state.joint_q)
         wp.copy(state.joint_qd, self.state.joint_qd)
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-        return state.body_q.numpy().reshape(self.num_worlds, -1, 7), state.body_qd.numpy().reshape(
-            self.num_worlds, -1, 6
-        )
+        n = self.num_worlds
+        return state.body_q.numpy().reshape(n, -1, 7), state.body_qd.numpy().reshape(n, -1, 6)
 
     @locked
     def base_velocity(self) -> np.ndarray:

@@ -181,7 +181,8 @@ class SolverJumper(SolverBase):
         self._check_state("state_in", state_in)
         if state_out is not state_in:
             self._check_state("state_out", state_out)
-        qdd, contact_f = state_out.body_qdd, None
+        qdd = state_out.body_qdd
+        contact_f = None
         if observables is not None:
             qdd = qdd if observables.body_qdd is None else observables.body_qdd
             contact_f = observables.contact_f
@@ -227,17 +228,21 @@ class SolverJumper(SolverBase):
 
         As `update_contacts`. Raises InputError: too few rows.
         """
-        dynamics, n, device = self.dynamics, self.model.world_count, self.model.device
+        dynamics = self.dynamics
+        n = self.model.world_count
+        device = self.model.device
         self._check("state.body_q", state.body_q, self._state_shapes["body_q"])
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
         if dynamics.ground_shape < 0:
             contacts.rigid_contact_count.zero_()
             return
-        rows, shapes = ContactRows(), PawShapes()
+        rows = ContactRows()
+        shapes = PawShapes()
         for name in rows._cls.vars:
             setattr(rows, name, getattr(contacts, f"rigid_contact_{name}"))
-        shapes.paws, shapes.ground = dynamics.paws, dynamics.ground_shape
+        shapes.paws = dynamics.paws
+        shapes.ground = dynamics.ground_shape
         for name in ("body", "transform", "scale"):
             setattr(shapes, name, getattr(self.model, f"shape_{name}"))
         contact_f.zero_()

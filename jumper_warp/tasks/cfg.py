@@ -48,7 +48,8 @@ TASK_BOUNDS = {
 }  # fmt: skip
 """Smallest and largest value of settings of a task, and unit."""
 LABEL = re.compile(r"[^/\[\]]+ \[[^\[\]]+\]")  # Name of a command's value, with its unit
-OF_EPISODE, OF_BASE = ("done", "termination", "level"), ("base_pos", "base_vel", "base_quat")
+OF_EPISODE = ("done", "termination", "level")
+OF_BASE = ("base_pos", "base_vel", "base_quat")
 """Names in `Env.task_arrays` that are no fields of the task's state, and that no field may have."""
 
 
@@ -111,7 +112,8 @@ class Command(Copyable):
 
         commands: (num_envs, n), or (n,) for all worlds; task: its name; worlds: (num_envs,) bool, to check bounds in.
         """
-        subject, num_envs = f"commands of {task} are {self}", len(worlds)
+        subject = f"commands of {task} are {self}"
+        num_envs = len(worlds)
         if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in self.counts]:
             raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
         steps = np.array([label.startswith("policy step") for label in self.labels] + 4 * [False])
@@ -237,7 +239,9 @@ class TaskCfg(Copyable):
 
     def _check_functions(self) -> None:
         """Raise InputError if a function of reset, command or curriculum does not fit the task."""
-        state, level, command = self.state, self.level_type, self.command
+        state = self.state
+        level = self.level_type
+        command = self.command
         reset = (RobotArrays, Scene, SkillSettings, state, self.settings_type, level, RngStream)
         robot = (RobotView, Scene, state)
         for where, func, takes, returns in (
@@ -264,7 +268,8 @@ class TaskCfg(Copyable):
 
         group: "actor" or "critic".
         """
-        columns, first = {}, 0
+        columns = {}
+        first = 0
         for term in getattr(self.observations, group):
             end = first + term.width * term.options["history"]
             columns[term.name], first = (first, end), end
@@ -362,7 +367,8 @@ class Handover(Copyable):
     def __post_init__(self) -> None:
         """Raise InputError if a field has a wrong type, or a function does not fit the states of the tasks."""
         check_types("handover:", self)
-        source, where = self.source.state, f"handover from {self.source.name} to {self.target.name},"
+        source = self.source.state
+        where = f"handover from {self.source.name} to {self.target.name},"
         check_result(f"{where} when", self.when, (RobotView, source, wp.bool), wp.bool)
         check_result(f"{where} begin", self.begin, (RobotView, source), self.target.state)
 

@@ -60,7 +60,8 @@ def check_function(
     Body and return type are checked only of functions from outside the project. where: part of the task, for messages.
     returns: type of the result in words; may_return: whether a type is valid.
     """
-    name, actual = func.key.rsplit(".", 1)[-1], list(func.input_types.values())
+    name = func.key.rsplit(".", 1)[-1]
+    actual = list(func.input_types.values())
     if len(actual) != len(takes):
         wanted = f"must have {len(takes)} arguments ({', '.join(map(shown_type, takes))})"
         raise InputError(f"{place_of(func)}: {where}: the function {wanted}, it has {len(actual)}")
@@ -84,7 +85,8 @@ def check_function(
 
 def _with_called(func: wp.Function) -> set[wp.Function]:
     """Return a Warp function and all functions from outside the project that it calls, directly or not."""
-    found, rest = set(), [func]
+    found = set()
+    rest = [func]
     while rest:
         each = rest.pop()
         if each not in found and not each.is_builtin() and is_own(each):
@@ -134,7 +136,8 @@ def check_values(where: str, settings: object, *args: float) -> None:
 
     The instance is checked only of settings from outside the project.
     """
-    struct, values = getattr(settings, "struct", None), getattr(settings, "values", None)
+    struct = getattr(settings, "struct", None)
+    values = getattr(settings, "values", None)
     if not isinstance(struct, Struct) or not callable(values):
         raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")
     if is_own(settings):

@@ -26,7 +26,8 @@ from jumper_warp.utils.checks import FLOAT32_MAX, in_float32, version_error
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import with_neighbours
 
-VERSION, LAST_OF_VERSION_4 = 5, "7f5b55c3"  # Version of the saved format; last commit that reads version 4
+VERSION = 5  # of the saved format
+LAST_OF_VERSION_4 = "7f5b55c3"  # Last commit that reads version 4
 OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
 
 

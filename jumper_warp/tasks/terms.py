@@ -62,7 +62,8 @@ class Term(Copyable):
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
             raise InputError(f"{kind}: {func!r:.60} is not a @wp.func")
-        self.func, self.name = func, name or func.key.split(".")[-1]
+        self.func = func
+        self.name = name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
         self._check_types(f"{place_of(func)}: {where}")
         python: Any = func.func
@@ -280,7 +281,8 @@ class EventTerm(Term):
 
     def __init__(self, func: Function, **values: Any) -> None:
         super().__init__(func, **values)
-        mode, interval = self.options["mode"], self.numbers["interval_range_s"]
+        mode = self.options["mode"]
+        interval = self.numbers["interval_range_s"]
         if mode not in ("startup", "reset", "interval"):
             raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
         if mode == "interval" and self.options["parallel"]:

@@ -100,7 +100,8 @@ class Level:
         """Return the curriculum level as a kernel struct, `JumpLevel`."""
         level = JumpLevel()
         level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
-        level.base_height, level.next_jump_probability = wp.vec2(*self.base_height), self.next_jump_probability
+        level.base_height = wp.vec2(*self.base_height)
+        level.next_jump_probability = self.next_jump_probability
         level.elliptical = int(self.elliptical)
         return level
 
@@ -223,7 +224,8 @@ class ResetCfg:
         Angles are in radians, delays in policy steps of step_dt [s].
         """
         settings = JumpSettings()
-        settings.states, settings.grounds = self._ranges(step_dt), self.ground.ranges()
+        settings.states = self._ranges(step_dt)
+        settings.grounds = self.ground.ranges()
         return settings
 
     @property

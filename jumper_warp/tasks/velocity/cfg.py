@@ -155,7 +155,8 @@ class VelocityResetCfg:
         Angles are in radians, times in policy steps of step_dt [s].
         """
         settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))
-        settings.episode_steps, settings.pace = round(self.episode / step_dt), self.gait * step_dt
+        settings.episode_steps = round(self.episode / step_dt)
+        settings.pace = self.gait * step_dt
         tiles = TileMap()
         tiles.rows, tiles.cols, tiles.tile = self.terrain.rows, self.terrain.cols, self.terrain.tile
         settings.map = tiles
