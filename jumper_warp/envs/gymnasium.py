@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from jumper_warp.envs.arrays import to_numpy
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
+from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.checks import MOST_SEED, check_count, check_flags
@@ -232,10 +232,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         return tensor if self.tensors else tensor.cpu().numpy()
 
     def _observation(self, groups: dict[str, torch.Tensor]) -> Obs:
-        """Return copies of observations in the form of the observation space, finite and within RAW_LIMIT."""
+        """Return copies of observations in the form of the observation space."""
         if not self._all_groups:
-            return self._converted(sanitise(groups["actor"]))
-        return {group: self._converted(sanitise(groups[group])) for group in ("actor", "critic")}
+            return self._converted(groups["actor"].clone())
+        return {group: self._converted(groups[group].clone()) for group in ("actor", "critic")}
 
     def _final_rows(self, obs: Obs, worlds: np.ndarray) -> np.ndarray:
         """Return the last observations of ended episodes as an object array (num_envs,), None for other worlds.

@@ -10,7 +10,7 @@ import torch
 from rsl_rl.env import VecEnv as RslRlEnv
 from tensordict import TensorDict
 
-from jumper_warp.envs.vec_env import VecEnv, sanitise
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.utils.files import write_atomically
 
 
@@ -79,7 +79,7 @@ class RslRlVecEnv(RslRlEnv):
 
     def get_observations(self) -> TensorDict:
         """Return the observations as groups `actor` and `critic`, finite and bounded."""
-        groups = {"actor": sanitise(self.env.obs), "critic": sanitise(self.env.critic_obs)}
+        groups = {"actor": self.env.obs.clone(), "critic": self.env.critic_obs.clone()}
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Protocols of the environments that PPO trains on, and `sanitise`, which makes observations finite."""
+"""Protocols of the environments that PPO trains on."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 RAW_LIMIT = 100.0
-"""Bound to which raw observations are clamped, so that one diverging world cannot spoil the statistics."""
+"""Largest absolute value of an observation: `Env` clamps to it, so that no world can spoil the statistics."""
 
 
 class VecEnv(Protocol):
     """Environment for PPO: many worlds whose ended episodes are reset in `step`.
 
-    The tensors are on `device`; `reset`, `step` and `load_state_dict` overwrite them in place.
+    The tensors are on `device`; `reset`, `step` and `load_state_dict` overwrite them in place. Observations are finite
+    and within ±RAW_LIMIT.
     """
 
     num_envs: int
@@ -77,8 +78,3 @@ class MirroredVecEnv(Protocol):
         Raises ValueError: no mirror image is defined.
         """
         ...
-
-
-def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """Return observations (in `out` if given) with non-finite entries set to 0, others clamped to ±RAW_LIMIT."""
-    return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

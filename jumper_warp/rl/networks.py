@@ -17,7 +17,6 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
@@ -64,7 +63,7 @@ class Scaling(NamedTuple):
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
-        """Return sanitised observations (..., n) normalised, clipped, and zero-padded to (..., columns)."""
+        """Return observations (..., n) normalised, clipped, and zero-padded to (..., columns)."""
         features = normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
         return functional.pad(features, (0, columns - obs.shape[-1]))
 
@@ -201,11 +200,11 @@ class ActorCritic(nn.Module):
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actor's input for raw observations (..., num_obs): normalised, within ±NORMALISED_LIMIT."""
-        return self.obs_moments.scaling().features(sanitise(obs), obs.shape[-1])
+        return self.obs_moments.scaling().features(obs, obs.shape[-1])
 
     def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's input for raw observations (..., num_critic_obs): normalised and clipped."""
-        return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
+        return self.critic_moments.scaling().features(critic_obs, critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (...), a normalised return, for normalised observations (..., num_critic_obs)."""

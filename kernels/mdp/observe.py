@@ -161,6 +161,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     return wp.kernel(unrolled(observe_kernel), name=name, module="unique", module_options=FAST)
 
 
+LIMIT = wp.constant(100.0)  # largest absolute value of an observation [1]
+
+
 @wp.func
 def finite_or_zero(value: float, diverged: bool) -> float:
     """Return the value of an observation, or 0 if its world diverged or the value is not finite."""
@@ -235,6 +238,7 @@ def postprocess(
         rng = stream_at(m.step_key, m.purpose, m.world, OBSERVATION + column.group)
         value += noise * wp.clamp(normal(rng, column.oldest), -p[column.noise_limit], p[column.noise_limit])
     value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
+    value = wp.clamp(value, -LIMIT, LIMIT)
     i = column.start + m.world * column.stride + column.oldest
     keep_frames = after_reset != 0 and m.history_reset == COMMANDED
     for _ in range(column.history - 1):

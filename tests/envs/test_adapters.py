@@ -11,7 +11,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
-from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.gym import env_id
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.learner import STATISTICS
@@ -105,22 +104,18 @@ def test_step_results_are_copies(tensors):
         np.testing.assert_array_equal(value, copy)
 
 
-def test_nonfinite_and_huge_values_are_replaced():
+def test_a_reward_that_is_not_finite_is_replaced():
     envs = GymVectorEnv(jumper())
     envs.reset()
     original = envs.env.step
 
     def step(action):
         result = original(action)
-        result.obs["actor"][0, :3] = torch.tensor([torch.nan, 1.0e6, -torch.inf])
         result.reward[0] = torch.nan
         return result
 
     envs.env.step = step
-    obs, reward, *_ = envs.step(ACTIONS[0])
-    assert obs[0, :3].tolist() == [0.0, RAW_LIMIT, 0.0]
-    assert obs in envs.observation_space
-    assert reward[0] == 0.0
+    assert envs.step(ACTIONS[0])[1][0] == 0.0
 
 
 # ---------------------------------------------------------------- Gymnasium: episodes

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from jump_helpers import edit_coordinates, edit_episodes, make_env, only
+from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.evaluation.commands import DumpCfg, play_dump
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
@@ -138,3 +139,15 @@ def test_dump_is_read_and_played(tmp_path, capsys):
     assert recording.is_file() and recording.with_suffix(".png").is_file()
     printed = capsys.readouterr().out
     assert f"jump, iteration 3, seed 11: {found}" in printed and "rewards that are not finite: below" in printed
+
+
+def test_observations_are_finite_and_bounded_whatever_their_terms_return():
+    task = make_task("vertical-jump")
+    actor = (ObservationTerm(below_twice, scale=1.0e6, history=2), *task.observations.actor)
+    observations = dataclasses.replace(task.observations, actor=actor)
+    env = make_env(N, task=dataclasses.replace(task, observations=observations), reset=only("default"))
+    lift(env, 3)
+    env.step(REST)
+    columns = env.obs[:, :2]  # older frames of 1 and below
+    assert env.obs.isfinite().all() and env.obs.abs().max() == RAW_LIMIT
+    assert columns[0].tolist() == [RAW_LIMIT] * 2

@@ -35,7 +35,7 @@ class NoiseTask(PushTask):
     def reset(self):
         for each in (self.obs, self.critic_obs):
             each.normal_().mul_(3.0).add_(1.0)
-        self.obs[0, 1], self.critic_obs[1, 0], self.obs[2, 3] = math.inf, math.nan, 1000.0
+        self.obs[0, 1], self.critic_obs[1, 0], self.obs[2, 3] = 100.0, -100.0, 100.0
 
     def step(self, action):
         self.reset()

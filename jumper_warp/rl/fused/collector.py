@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from jumper_warp.envs.vec_env import RAW_LIMIT, VecEnv
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.fused import kernels
@@ -53,7 +53,7 @@ class ObservationWriter:
         step: whose moments they count for (default: none).
         """
         launch(kernels.observe, self._grid, num_warps=8)(
-            obs, *obs.stride(), *self._scaling, features, self._sums[step], *obs.shape, features.shape[1], RAW_LIMIT,
+            obs, *obs.stride(), *self._scaling, features, self._sums[step], *obs.shape, features.shape[1],
             NORMALISED_LIMIT, ROWS, 64,
         )  # fmt: skip
 

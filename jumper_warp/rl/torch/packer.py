@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import torch
 
-from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import MirrorMap
@@ -104,7 +103,7 @@ def compute_values_and_gae(
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
         scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
-        heads = [critic.forward(scaling.features(sanitise(chunk), columns))[0] for chunk in chunks]
+        heads = [critic.forward(scaling.features(chunk, columns))[0] for chunk in chunks]
         return torch.cat(heads).view(critic_obs.shape[:2])
 
     head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)

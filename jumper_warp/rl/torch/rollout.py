@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from jumper_warp.envs.vec_env import VecEnv, sanitise
+from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
@@ -15,8 +15,8 @@ from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
 class RolloutBuffer(NamedTuple):
     """Transitions (observations, action, reward, done) of all worlds over num_steps policy steps."""
 
-    obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
-    critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs without `asymmetric_critic`
+    obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs)
+    critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs); obs without `asymmetric_critic`
     final_critic_obs: torch.Tensor  # (num_steps, num_envs, num_critic_obs) after the step, before a reset
     action: torch.Tensor  # (num_steps, num_envs, num_actions) sampled
     mean: torch.Tensor  # (num_steps, num_envs, num_actions) of the policy
@@ -74,8 +74,8 @@ class Collector:
             self._act_step(step)
             env.step(step.action)
             self._record_step(step)
-        rollout.obs[-1] = sanitise(env.obs)
-        rollout.critic_obs[-1] = sanitise(self._critic_obs)
+        rollout.obs[-1] = env.obs
+        rollout.critic_obs[-1] = self._critic_obs
 
     def _act_step(self, step: RolloutBuffer) -> None:
         """Sample actions for the current state; write them, mean and observations to `step` (`RolloutBuffer.at`)."""
@@ -96,9 +96,9 @@ def sample_action(
     obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
     scaling: normalises obs.
     """
-    step.obs.copy_(sanitise(obs))
-    step.critic_obs.copy_(sanitise(critic_obs))
-    mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1])).mean
+    step.obs.copy_(obs)
+    step.critic_obs.copy_(critic_obs)
+    mean = actor.forward(scaling.features(obs, actor.layers.weights[0].shape[1])).mean
     step.mean.copy_(mean)
     step.action.mul_(actor.log_std.exp()).add_(mean)
 

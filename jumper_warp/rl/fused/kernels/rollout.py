@@ -9,19 +9,18 @@ from jumper_warp.rl.fused.kernels.scalar import HALF_LOG_TAU, finite_or_zero
 
 @triton.jit(do_not_specialize=["row_stride", "num_obs"], do_not_specialize_on_alignment=["obs"])
 def observe(
-    obs, row_stride, col_stride, mean, std, features, moments, rows, num_obs, width, raw_limit, limit,
+    obs, row_stride, col_stride, mean, std, features, moments, rows, num_obs, width, limit,
     BM: tl.constexpr, BN: tl.constexpr,
 ):  # fmt: skip
     """Write normalised, zero-padded observations, (rows, width), and sums for mean and variance of the raw ones.
 
-    obs: (rows, num_obs) raw, sanitised as `vec_env.sanitise`; mean, std: (num_obs,). moments: (blocks, 2, width) sums
+    obs: (rows, num_obs) raw; mean, std: (num_obs,). moments: (blocks, 2, width) sums
     of the difference from `mean`, and of its square.
     """
     row = tl.program_id(0) * BM + tl.arange(0, BM)
     col = tl.program_id(1) * BN + tl.arange(0, BN)
     valid = (row < rows)[:, None] & (col < num_obs)[None, :]
     raw = tl.load(obs + row.to(tl.int64)[:, None] * row_stride + col[None, :] * col_stride, mask=valid, other=0.0)
-    raw = tl.minimum(tl.maximum(finite_or_zero(raw), -raw_limit), raw_limit)
     difference = raw - tl.load(mean + col, mask=col < num_obs, other=0.0)[None, :]
     scaled = difference / tl.load(std + col, mask=col < num_obs, other=1.0)[None, :]
     scaled = tl.where(valid, tl.minimum(tl.maximum(scaled, -limit), limit), 0.0)
