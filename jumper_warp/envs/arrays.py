@@ -37,9 +37,8 @@ def robot_arrays(sim: Simulation, step_dt: float) -> KernelStruct:
     n = sim.num_worlds
     device = sim.device
     robot = RobotArrays()
-    robot.joint_q = sim.state.joint_q
-    robot.joint_qd = sim.state.joint_qd
-    robot.body_f = sim.state.body_f
+    for name in ("joint_q", "joint_qd", "body_f"):
+        setattr(robot, name, getattr(sim.state, name))
     robot.body_com = sim.model.body_com
     robot.gravity = sim.model.gravity
     robot.diverged = sim.dynamics.work.diverged

@@ -61,12 +61,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: see the class; the modes' values "SameStep", "NextStep", "Disabled" are accepted too.
         render_mode: "rgb_array", or None to draw nothing. render_size: width and height of an image [px]. render_envs:
         number of worlds drawn, from the first on.
-        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another autoreset_mode or
-        render_mode, a size outside 16 to 7680 px, or render_envs no whole number of at least 1.
+        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another render_mode, a
+        size outside 16 to 7680 px, or render_envs no whole number of at least 1. ValueError: another autoreset_mode.
         """
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
-        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         _check_size(render_size)
         render_envs = check_count("render_envs", render_envs)
         check_flags(all_groups=all_groups, tensors=tensors)
@@ -293,15 +293,6 @@ class GymEnv(gymnasium.Env):
 def _first(obs: Obs) -> Any:
     """Return the first world's observation, from observations of all worlds."""
     return {group: values[0] for group, values in obs.items()} if isinstance(obs, dict) else obs[0]
-
-
-def _checked_mode(mode: Any) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode from the enum's member or value. Raises InputError: there is no such mode."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError as error:
-        modes = ", ".join(repr(each.value) for each in AutoresetMode)
-        raise InputError(f"autoreset_mode must be one of {modes}, got {mode!r:.40}") from error
 
 
 def _check_size(size: tuple[int, int]) -> None:

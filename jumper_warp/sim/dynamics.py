@@ -93,17 +93,10 @@ def check_model(model: Model) -> None:
     if count < 1:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for noun, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
-        names = [label.split("/")[-1] for label in labels]
-        unknown = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
-        if unknown is not None and len(names) > count * len(expected):
-            raise NotThisRobotError(f"{noun} {unknown!r:.60} cannot be simulated: every world must hold {ALONE}")
-        if len(names) != count * len(expected):
-            raise NotThisRobotError(
-                f"{count} worlds of this robot have {count * len(expected)} {noun} labels, the model has {len(names)}"
-            )
-        for i, name in enumerate(names):
-            if name != expected[i % len(expected)]:
-                raise NotThisRobotError(f"{noun} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
+        for label, name in itertools.zip_longest(labels, count * expected):
+            if label is None or label.split("/")[-1] != name:
+                found = f"{noun} {label!r:.60} cannot be simulated in place of {name!r}"
+                raise NotThisRobotError(f"{found}: every world must hold {ALONE}")
     for name, size, per_world in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
         if size != count * per_world:
             raise NotThisRobotError(f"{name} must hold {per_world} values a world, found {size / count:g}")
