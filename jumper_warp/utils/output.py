@@ -1,6 +1,5 @@
 """Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.files import json_bytes, read_json, write_atomically
 from jumper_warp.utils.metrics import AnyMetrics, MetricValue, Scalar, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
@@ -81,12 +80,15 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 
 
 def read_report(folder: Path) -> Report:
-    """Read the metrics and conditions of a run from its `metrics.json`."""
+    """Read the metrics and conditions of a run from its `metrics.json`. Raises InputError: it is missing or damaged."""
     path = folder / "metrics.json"
-    document = json.loads(path.read_bytes())
-    entries = document["metrics"].items()
-    metrics = {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries}
-    return Report(path, document["conditions"], metrics)
+    document = read_json(path, "metrics of an evaluation")
+    try:
+        entries = document["metrics"].items()
+        metrics = {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries}
+        return Report(path, document["conditions"], metrics)
+    except (LookupError, TypeError, AttributeError):
+        raise InputError(f"{path}: not the metrics of an evaluation") from None
 
 
 def read_values(folder: Path) -> dict[str, Any]:
