@@ -18,11 +18,10 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
-from jumper_warp.robot.model import build_model
+from jumper_warp.robot.model import MOTOR_DOFS, build_model
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
@@ -79,8 +78,7 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     The robot is the first one of `values`. Keys: those of UNITS.
     """
     n = len(states["angles"])
-    model = build_model(n, ground=None, visuals=False, device="cpu")
-    write_model(model, values)
+    model = build_model(n, ground=None, visuals=False, device="cpu", robot=values)
     model.joint_friction.zero_()
     model.joint_damping.zero_()
     dynamics = JumperDynamics(model, double=True)
@@ -101,7 +99,7 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
 
     after = array(q), array(qd)
     drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vectorf, device="cpu"))
-    dynamics.advance(dynamics.settings(DT, 1, 50, 1.0e-5), drive, *after, *after)
+    dynamics.advance(DT, 1, drive, *after, *after)
     new_q, new_qd = (rows.numpy().reshape(n, -1) for rows in after)
     (turn, origin, spin), (_, new_origin, new_spin) = base_velocity(q, qd), base_velocity(new_q, new_qd)
     accelerations = {

@@ -20,8 +20,8 @@ from jumper_warp.diff.rollout import Rollout, Trajectory, compact
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
+from jumper_warp.sim.dynamics import TOLERANCE
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.sim.solver import MAX_SWEEPS, TOLERANCE
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
@@ -48,7 +48,6 @@ class PlainJump:
         wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vectorf, device=rollout.device)
         motors = rollout.motors
         drive = dynamics.drive(rollout.array(np.zeros(DOFS * n)), wrench, motors, filtered)
-        settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
         def run() -> None:
             """Simulate the jump from its start: per target one command filter launch and SUBSTEPS physics steps."""
@@ -60,7 +59,7 @@ class PlainJump:
                     modules.command_filter.command_filter_kernel, dim=(4, n), device=rollout.device,
                     inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[filtered],
                 )  # fmt: skip
-                dynamics.advance(settings, drive, self._q, self._qd, self._q, self._qd)
+                dynamics.advance(PHYSICS_DT, SUBSTEPS, drive, self._q, self._qd, self._q, self._qd)
 
         run()
         with wp.ScopedCapture(device=rollout.device) as capture:

@@ -47,7 +47,7 @@ def soak(env: Env, args: Args) -> dict[str, float]:
     """
     env.reset()
     assert isinstance(env.sim.solver, SolverJumper)
-    residual, tolerance = wp.to_torch(env.sim.solver.residual), env.sim.solver.tolerance
+    residual, tolerance = wp.to_torch(env.sim.solver.residual), env.sim.dynamics.tolerance
     q, qd = (wp.to_torch(x).view(env.num_envs, -1) for x in (env.sim.state.joint_q, env.sim.state.joint_qd))
     termination, diverged = wp.to_torch(env.episodes.termination), env.task.termination_names.index("diverged")
     action, counts, speeds = torch.zeros_like(env.action), torch.zeros_like(qd[0, :3]).double(), qd.new_zeros(2)

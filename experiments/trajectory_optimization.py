@@ -133,7 +133,7 @@ class MotionReplay:
         pose = sim.state.body_q.numpy().copy()
         self.states.append(compact(sim.joint_q(), sim.joint_qd()))
         flags, clearance = wp.zeros(1, dtype=int, device=sim.device), wp.zeros(1, dtype=float, device=sim.device)
-        robot = sim.physics.dynamics.robot
+        robot = sim.dynamics.robot
         wp.launch(
             collision_kernel, dim=1, inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
             outputs=[flags, clearance], device=sim.device,

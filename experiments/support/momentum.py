@@ -46,7 +46,7 @@ class LinkStates(NamedTuple):
 def _links(sim: Any) -> LinkStates:
     """Return the present state of all links of a `Simulation`; waits for the device."""
     model, n = sim.model, sim.num_worlds
-    sim.physics.write_bodies()
+    sim.write_bodies()
     pose = sim.state.body_q.numpy().reshape(n, -1, 7).astype(float)
     twist = sim.state.body_qd.numpy().reshape(n, -1, 6).astype(float)
     mass = model.body_mass.numpy().reshape(n, -1, 1).astype(float)

@@ -17,8 +17,8 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.logger import Stopwatch
 from jumper_warp.robot.model import build_model
-from jumper_warp.sim.simulation import Simulation, SolverName
-from jumper_warp.sim.slices import SlicedGraph, WorldRange
+from jumper_warp.sim.dynamics import WorldRange
+from jumper_warp.sim.simulation import Simulation, SlicedGraph, SolverName
 from support.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
@@ -110,7 +110,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     check_standing(sim, 0.40)
 
     def advance(worlds: WorldRange) -> None:
-        sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
+        sim.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
     graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # the graph does not keep its arrays alive
     return lambda: graph_and_sim[0].replay()

@@ -48,7 +48,7 @@ class SquatLog(EvaluationLog):
         `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,).
         """
         return {
-            "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
+            "peak": env.sim.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
             "torque": env.sim.torque.numpy().T.copy(), "termination": env.episodes.termination.numpy().copy(),
         }  # fmt: skip

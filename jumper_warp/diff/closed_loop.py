@@ -101,7 +101,8 @@ class ClosedLoop:
         for term in task.observations.actor:
             if term.options["history"] > 1 and term.func.key not in STATE_TERMS:
                 raise InputError(f"{task.name}: gradients need histories of the robot's state, not of {term.name}")
-        self.env, self.num_worlds = env, env.num_envs
+        self.env = env
+        self.num_worlds = env.num_envs
         self.rollout = Rollout(
             robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
         )
@@ -155,7 +156,8 @@ class ClosedLoop:
 
         Each term drops its oldest frame and appends its frame at `state`, as in `LoopState.history`.
         """
-        motion, frames = self.motion(state), []
+        motion = self.motion(state)
+        frames = []
         for (term, _, _), past in zip(self._history_terms, self._histories(state), strict=True):
             frames += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
         return torch.cat(frames, 1).T if frames else state.history
@@ -187,7 +189,8 @@ class ClosedLoop:
             self.rollout, targets[None], state.q, state.qd, initial_target=state.initial_target,
             impulse=state.impulse, wrench=None if wrench is None else wrench[None], trusted=True, **(parameters or {}),
         )  # fmt: skip
-        end, history = trajectory.end(), self._next_history(state)
+        end = trajectory.end()
+        history = self._next_history(state)
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
@@ -204,7 +207,9 @@ class ClosedLoop:
 
         observed: the environment's observation, from which columns without derivatives, such as commands, are copied.
         """
-        motion, columns, histories = self.motion(state), [], iter(self._histories(state))
+        motion = self.motion(state)
+        columns = []
+        histories = iter(self._histories(state))
         for term, first, end in self._columns:
             value = observed[:, first:end].to(self.dtype)
             if term.options["history"] > 1:
@@ -224,7 +229,8 @@ class ClosedLoop:
         parameters = self.read_parameters() if self.randomizes else None
         env.step(action.detach())
         wrench = env.snapshot().wrench.to(self.dtype).contiguous() if self.randomizes else None
-        simulated, after = self.advance(state, action, wrench, parameters), self.state()
+        simulated = self.advance(state, action, wrench, parameters)
+        after = self.state()
         reset = env.done > 0.0 if env.auto_reset else torch.zeros_like(env.done, dtype=torch.bool)
         parts = []
         for name, value, computed in zip(LoopState._fields, after, simulated, strict=True):

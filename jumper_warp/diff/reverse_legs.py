@@ -5,11 +5,10 @@ Four launches for every `SPAN` saved rows of the trajectory.
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.utils.kernels import Kernel, KernelStruct
 
 SPAN = 4  # rows that one set of launches reverses
 
@@ -25,15 +24,18 @@ class LegThreadReverse:
 
         every: physics steps between rows of a trajectory.
         """
-        self._dynamics, self._modules = dynamics, dynamics.modules
-        self._device, self._num = dynamics.model.device, dynamics.model.world_count
-        module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
+        self._dynamics = dynamics
+        self._modules = dynamics.modules
+        self._device = dynamics.model.device
+        self._num = dynamics.model.world_count
+        module = self._modules.leg_record
+        shape = {"dtype": dynamics.real, "device": self._device}
         self._record = module.LegRecord()
         entries = SPAN * (every + 1)
         self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
         self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
 
-    def run(self, settings: Any, motion: list[Any], cotangents: Any, gradients: Any) -> None:
+    def run(self, settings: KernelStruct, motion: list, cotangents: KernelStruct, gradients: KernelStruct) -> None:
         """Backpropagate through a rollout, and add the gradients w.r.t. its inputs to `gradients`.
 
         `gradients`: `Gradients`; its q and qd must hold the last row's cotangents. All arguments are structs of the
@@ -41,13 +43,16 @@ class LegThreadReverse:
         num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the gradient of the loss w.r.t.
         the rollout's.
         """
-        robot, record, num = self._dynamics.robot, self._record, self._num
-        legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint
+        robot = self._dynamics.robot
+        record = self._record
+        num = self._num
+        legs = self._modules.rollout_legs_adjoint
+        constants = self._modules.constants_adjoint
         timing, *actuated, rows = motion
         turns = 8 if self._device.is_cuda else 1  # a GPU warp holds eight worlds, or eight steps of one world
         threads = -(-num // 8) * 8
 
-        def launch(kernel: wp.Kernel, dim: tuple[int, ...], *inputs: Any) -> None:  # over dim and the four legs
+        def launch(kernel: Kernel, dim: tuple[int, ...], *inputs: object) -> None:  # over dim and the four legs
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
         for end in range(rows.q.shape[0] - 1, 0, -SPAN):

@@ -7,14 +7,14 @@ physics steps, motor torques and the paws' impulses are stored; see `jumper_warp
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from jumper_warp.diff.reverse_legs import LegThreadReverse
 from jumper_warp.robot.description import RobotDescription
@@ -27,14 +27,13 @@ from jumper_warp.robot.motors import (
     jumping_motors,
     motor_arrays,
 )
-from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.dynamics import JumperDynamics, WorldRange, check_step, slices_of
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
-from jumper_warp.sim.slices import WorldRange, slices_of
-from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.threads import checked_threads, locked, run_in_parallel
 
@@ -68,7 +67,7 @@ class Trajectory:
     pressed: wp.array
     """(T S, 4, num_worlds) Bit sets of each leg's pressed hard stops, see `jumper_warp.kernels.actuation.stops`."""
     filtered_target: wp.array  # (T, 12, num_worlds) [rad] Targets after the command filter
-    commands: Any  # The kernels' `Commands` of the rollout
+    commands: KernelStruct  # The kernels' `Commands` of the rollout
     from_start: bool = False
     """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
@@ -122,13 +121,17 @@ class Rollout(Uncopied):
         every = substeps if every is None else every
         if every not in range(1, substeps + 1) or substeps % every != 0:
             raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
-        if tolerance is not None and not 0.0 < tolerance < math.inf:
-            raise InputError(f"tolerance must be finite and positive, got {tolerance!r:.40}")
-        self.dynamics = JumperDynamics(model, description=description, double=double)
-        self.num_worlds, self.device, self.real = model.world_count, model.device, self.dynamics.real
-        self.dt, self.substeps, self.every = dt, substeps, every
-        tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
-        self._new_settings = partial(self.dynamics.settings, dt, 1, MAX_SWEEPS, tolerance)
+        if tolerance is None:
+            tolerance = TOLERANCE_DOUBLE if double else TOLERANCE
+        self.dynamics = JumperDynamics(
+            model, description=description, max_sweeps=MAX_SWEEPS, tolerance=tolerance, double=double
+        )
+        self.num_worlds = model.world_count
+        self.device = model.device
+        self.real = self.dynamics.real
+        self.dt = dt
+        self.substeps = substeps
+        self.every = every
         self._actuation = self._make_actuation(motors or jumping_motors(), command_filter)
         self.motors = self._actuation.motors  # The kernels' `MotorArrays`, whose arrays are among the parameters
         self.parameters: dict[str, wp.array] = {
@@ -148,16 +151,17 @@ class Rollout(Uncopied):
         self.slices = slices_of(self.num_worlds, 1 if self.device.is_cuda else checked_threads(threads))
         wrench = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
-        self._record: Any = None
+        self._record: KernelStruct | None = None
         self._legs: LegThreadReverse | None = None
-        self._launched: set[str] = set()
+        self._launched: set[Kernel] = set()
 
-    def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> Any:
+    def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> KernelStruct:
         """Return the constants of motors, latency and command filter of all worlds as the struct that the kernels read.
 
         The latency is zero.
         """
-        modules, n = self.dynamics.modules, self.num_worlds
+        modules = self.dynamics.modules
+        n = self.num_worlds
         actuation = modules.trajectory.Actuation()
         actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
         actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
@@ -174,7 +178,7 @@ class Rollout(Uncopied):
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
     @locked
-    def hold(self, worlds: Any = True) -> None:
+    def hold(self, worlds: ArrayLike = True) -> None:
         """Fix the bases of some worlds at their initial pose and velocity; release those of the others.
 
         worlds: bool, (num_worlds,) or one for all. Raises InputError: another shape or type.
@@ -212,12 +216,12 @@ class Rollout(Uncopied):
     @locked
     def run(
         self,
-        targets: Any,
-        q: Any,
-        qd: Any,
+        targets: wp.array | np.ndarray | Sequence,
+        q: wp.array | ArrayLike,
+        qd: wp.array | ArrayLike,
         *,
-        initial_target: Any = None,
-        wrench: Any = None,
+        initial_target: wp.array | ArrayLike | None = None,
+        wrench: wp.array | ArrayLike | None = None,
         impulse: wp.array | None = None,
     ) -> Trajectory:
         """Simulate all worlds over T policy steps, and return their trajectory.
@@ -241,7 +245,7 @@ class Rollout(Uncopied):
         if not self.device.is_cuda:
             check_within("latency [s]", self.parameters["latency"].numpy(), LATENCY_RANGE)
         vec3 = self.dynamics.modules.scalar.vec3
-        count = len(targets) if hasattr(targets, "__len__") else 0
+        count = len(targets)
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
@@ -291,7 +295,8 @@ class Rollout(Uncopied):
         `parameters`, and `geometry` (4, 10, num_worlds) w.r.t. the legs' lengths. The gradient w.r.t. the initial
         quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
-        n, modules = self.num_worlds, self.dynamics.modules
+        n = self.num_worlds
+        modules = self.dynamics.modules
         commands = trajectory.commands
         count = commands.target.shape[0]
         rows_of = (count * self.substeps // self.every + 1, 19, n)
@@ -317,7 +322,7 @@ class Rollout(Uncopied):
                     wp.copy(into, last[-1])
             if self._legs is None:
                 self._legs = LegThreadReverse(self.dynamics, self.every)
-            self._legs.run(self._new_settings(), motion, cotangents, gradients)
+            self._legs.run(self.dynamics.settings(self.dt, 1), motion, cotangents, gradients)
         else:
             if self._record is None:
                 self._record = self.dynamics.step_record(self.every)
@@ -327,7 +332,7 @@ class Rollout(Uncopied):
         by_inputs = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "wrench": gradients.wrench}
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
-    def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
+    def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> KernelStruct:
         """Collect the loss gradients w.r.t. the arrays of a trajectory in a struct, the input of the reverse kernels.
 
         Empty for None and filtered_target. Raises InputError: another shape or type than the trajectory's array.
@@ -352,22 +357,24 @@ class Rollout(Uncopied):
 
         gradient: (GRADIENT_ROWS, num_worlds); views are shaped as `parameters` and `geometry`.
         """
-        names, first = {}, 0
+        names = {}
+        first = 0
         for name, array in self.parameters.items():
             count = 1 if array.ndim == 1 else array.shape[0]
             names[name] = gradient[first : first + count] if array.ndim > 1 else gradient[first]
             first += count
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
-    def _timing(self, count: int) -> Any:
+    def _timing(self, count: int) -> KernelStruct:
         """Return the struct with a rollout's numbers of policy and physics steps, which the kernels read."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
-    def _rows(self, count: int) -> Any:
+    def _rows(self, count: int) -> KernelStruct:
         """Allocate the arrays that record a rollout of `count` policy steps, uninitialised."""
-        steps, n = count * self.substeps, self.num_worlds
+        steps = count * self.substeps
+        n = self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
@@ -375,21 +382,20 @@ class Rollout(Uncopied):
         rows.pressed = self._empty(steps, 4, n, dtype=wp.uint8)
         return rows
 
-    def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+    def _launch_legs(self, kernel: Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds, padded to a multiple of 8, with a thread for each leg."""
         n = self.num_worlds
-        inputs = [n, self.dynamics.robot, self._new_settings(), *inputs]
+        inputs = [n, self.dynamics.robot, self.dynamics.settings(self.dt, 1), *inputs]
         wp.launch(
             kernel, dim=(-(-n // 8) * 8, 4), inputs=inputs, outputs=outputs,
             device=self.device, block_dim=32 if self.device.is_cuda else 4,
         )  # fmt: skip
 
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel over all worlds with a thread for each world; on a CPU concurrently over `slices`."""
 
         def launch(worlds: WorldRange) -> None:
-            settings = self._new_settings()  # copies of a Warp struct share memory, and slices run concurrently
-            settings.first = worlds.first
+            settings = self.dynamics.settings(self.dt, 1, worlds.first)
             wp.launch(
                 kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,
                 device=self.device, block_dim=32 if self.device.is_cuda else 1,
@@ -397,10 +403,10 @@ class Rollout(Uncopied):
 
         jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]
         # Warp loads a kernel at its first launch; if two threads do so at once, one of them launches nothing
-        run_in_parallel(jobs, len(jobs) if kernel.key in self._launched else 1)
-        self._launched.add(kernel.key)
+        run_in_parallel(jobs, len(jobs) if kernel in self._launched else 1)
+        self._launched.add(kernel)
 
-    def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
+    def _input(self, name: str, values: wp.array | ArrayLike, shape: tuple[int, ...]) -> wp.array:
         """Return an argument of `run` as a Warp array, after a check of its shape, type and values.
 
         Shape (*shape, num_worlds); NumPy values may lack the last axis. name: of the argument, for messages. Raises
@@ -424,18 +430,18 @@ class Rollout(Uncopied):
             raise InputError(f"{name} must be finite")
         return self.array(values)
 
-    def array(self, values: Any) -> wp.array:
+    def array(self, values: ArrayLike) -> wp.array:
         """Convert values to a new Warp array of the rollout's precision on its device."""
-        return wp.array(values, dtype=self.real, device=self.device)
+        return wp.array(np.asarray(values), dtype=self.real, device=self.device)
 
-    def vectors(self, values: Any) -> wp.array:
+    def vectors(self, values: ArrayLike) -> wp.array:
         """Convert vectors (..., 3) to a new Warp array (...) of the kernels' vec3."""
         return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
 
-    def _zeros(self, *shape: int, dtype: Any = None) -> wp.array:
+    def _zeros(self, *shape: int, dtype: type | None = None) -> wp.array:
         return wp.zeros(shape, dtype=dtype or self.real, device=self.device)
 
-    def _empty(self, *shape: int, dtype: Any = None) -> wp.array:
+    def _empty(self, *shape: int, dtype: type | None = None) -> wp.array:
         return wp.empty(shape, dtype=dtype or self.real, device=self.device)
 
 

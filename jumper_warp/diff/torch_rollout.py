@@ -129,7 +129,10 @@ class _Simulate(torch.autograd.Function):
             if impulse is not None:
                 commands["impulse"] = wp.from_torch(impulse, dtype=rollout.dynamics.modules.scalar.vec3)
             trajectory = rollout.run(**commands)
-        ctx.rollout, ctx.names, ctx.trajectory, ctx.writes = rollout, names, trajectory, dict(rollout.writes)
+        ctx.rollout = rollout
+        ctx.names = names
+        ctx.trajectory = trajectory
+        ctx.writes = dict(rollout.writes)
         outputs = [wp.to_torch(getattr(trajectory, name)) for name in OUTPUTS]
         ctx.save_for_backward(*tensors, *outputs)  # outputs so that torch detects in-place changes
         ctx.set_materialize_grads(False)
@@ -143,7 +146,8 @@ class _Simulate(torch.autograd.Function):
         """
         if torch.is_grad_enabled():  # as `create_graph` sets it; gradients of a linear loss would have no graph
             raise InputError("simulate has no second derivatives: create_graph must be False")
-        rollout, trajectory = ctx.rollout, ctx.trajectory
+        rollout = ctx.rollout
+        trajectory = ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
         if lost := changed - given.keys():

@@ -1,9 +1,8 @@
-"""Allocation of an environment's kernel arrays, and checks of arguments such as tasks, actions and commands."""
+"""Allocation of an environment's kernel arrays, and checks of arguments such as actions and commands."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,35 +11,43 @@ import warp as wp
 from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays, Scene
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.tasks.cfg import Handover, TaskCfg
-from jumper_warp.tasks.overlay_ranges import with_own_ranges
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
 FIRST_STEP_COUNT = 2 * RING
 """Step count of every world at the start; ring buffers need a positive index for earlier steps."""
 
 
-def allocate(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], dtype: Any, device: Any) -> None:
+def allocate(
+    struct: KernelStruct, names: Iterable[str], shape: int | tuple[int, ...], dtype: type, device: wp.DeviceLike
+) -> None:
     """Set each named member of a kernel struct to a new array of zeros."""
     for name in names:
         setattr(struct, name, wp.zeros(shape, dtype=dtype, device=device))
 
 
-def robot_arrays(sim: Simulation, step_dt: float) -> Any:
+def robot_arrays(sim: Simulation, step_dt: float) -> KernelStruct:
     """Return the kernels' `RobotArrays`: views of a simulation's state and forces, and new arrays for paws and motors.
 
     step_dt [s]: policy step.
     """
-    n, device, robot = sim.num_worlds, sim.device, RobotArrays()
-    robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
-    robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
-    robot.diverged, robot.impulse = sim.physics.diverged, sim.physics.impulse
-    robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
-    robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
+    n = sim.num_worlds
+    device = sim.device
+    robot = RobotArrays()
+    for name in ("joint_q", "joint_qd", "body_f"):
+        setattr(robot, name, getattr(sim.state, name))
+    robot.body_com = sim.model.body_com
+    robot.gravity = sim.model.gravity
+    robot.diverged = sim.dynamics.work.diverged
+    robot.impulse = sim.dynamics.work.impulse
+    robot.paw_force = sim.paw_force
+    robot.peak_force = sim.peak_paw_force
+    robot.torque = sim.torque
+    robot.joint_offset = sim.motors.offset
     motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")
     allocate(robot, ("paw_pos", "paw_vel"), (4, n), wp.vec3, device)
     allocate(robot, ("contact_time", "air_time", "touchdown_speed", "paw_height"), (4, n), float, device)
@@ -52,13 +59,15 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     return robot
 
 
-def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: Any) -> Any:
+def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: wp.DeviceLike) -> KernelStruct:
     """Return new arrays of every world's episode state (`EpisodeArrays`), ready for the first reset.
 
     skill: (num_envs,) index of each world's task.
     """
     episode = EpisodeArrays()
-    episode.seed, episode.purpose, episode.skill = seed, PURPOSES.index(stream), skill
+    episode.seed = seed
+    episode.purpose = PURPOSES.index(stream)
+    episode.skill = skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
               "streak")  # fmt: skip
     allocate(episode, ("pending_command",), num_envs, wp.vec4, device)
@@ -71,7 +80,7 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
     return episode
 
 
-def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
+def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: wp.DeviceLike) -> KernelStruct:
     """Return the ring buffers that delay motor targets in the kernels (`Delays`).
 
     latency: (num_envs,) int [physics steps]; substeps: physics steps in a policy step.
@@ -80,67 +89,22 @@ def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -
     allocate(delays, ("target_history",), (RING, 12, num_envs), float, device)
     allocate(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
     allocate(delays, ("switch_step",), num_envs, int, device)
-    delays.steps, delays.substeps = latency, substeps
+    delays.steps = latency
+    delays.substeps = substeps
     return delays
 
 
-def scene_of(sim: Simulation) -> Any:
+def scene_of(sim: Simulation) -> KernelStruct:
     """Return the kernels' `Scene` (ground and robot constants) of a simulation."""
-    scene, robot = Scene(), sim.physics.dynamics.robot
-    scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
+    scene = Scene()
+    robot = sim.dynamics.robot
+    scene.geometry = robot.geometry
+    scene.ground = robot.ground
+    scene.reference_q = sim.model.joint_q
     return scene
 
 
-def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
-    """Check the tasks and handovers (switches between tasks) of one environment, and return the tasks as a tuple.
-
-    task: a `TaskCfg` or several.
-    Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
-    torque, over-speed protection or gravity; or a handover is none, or refers to another task.
-    """
-    is_sequence = isinstance(task, Iterable) and not isinstance(task, str)
-    tasks: tuple[Any, ...] = tuple(task) if is_sequence else (task,)
-    for each in tasks:
-        if not isinstance(each, TaskCfg):
-            raise InputError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
-    names = [each.name for each in tasks]
-    if not tasks or len(set(names)) < len(names):
-        raise InputError(f"an environment needs at least one task, and unique names, got {names}")
-    first = tasks[0].motors
-    limits = (first.fade_start, first.fade_end, first.lateral.peak, first.transversal.peak)
-    for each in tasks[1:]:
-        motors = each.motors
-        if (motors.fade_start, motors.fade_end, motors.lateral.peak, motors.transversal.peak) != limits:
-            raise InputError(f"{each.name} and {names[0]} must have equal peak torque and over-speed protection")
-        if each.gravity != tasks[0].gravity:
-            raise InputError(f"gravity of {each.name} must be {tasks[0].gravity} m/s^2, got {each.gravity}")
-    for each in handovers if isinstance(handovers, Iterable) else (handovers,):
-        if not isinstance(each, Handover):
-            raise InputError(f"handovers must be a sequence of Handover, got {handovers!r:.60}")
-        if each.source not in tasks or each.target not in tasks:
-            raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
-    return tasks
-
-
-def prepared_tasks(
-    tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool, robot: RobotOverlay | None = None
-) -> tuple[tuple[TaskCfg, ...], bool]:
-    """Return tasks with an environment's randomisation and noise options applied, and whether resets sample the ground.
-
-    Without randomize tasks are nominal, with it they have the ranges of the overlay `robot`. Without noise their
-    observations are exact. Ground is sampled only with randomize and ground_may_vary.
-    """
-    prepared, draws = [], False
-    for task in tasks:
-        if not (randomize and ground_may_vary):
-            task = task.on_level_ground()
-        draws = draws or task.draws_ground
-        task = with_own_ranges(task, robot) if randomize else task.nominal()
-        prepared.append(task if noise else task.without_noise())
-    return tuple(prepared), draws
-
-
-def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+def checked_action(action: object, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
     """Check type, shape and device of a policy action, and return it without gradient.
 
     Raises InputError: no floating-point tensor of this shape and device.
@@ -156,12 +120,12 @@ def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) ->
     return action.detach()
 
 
-def to_numpy(values: Any) -> Any:
+def to_numpy(values: object) -> object:
     """Return a torch tensor as a NumPy array, and anything else unchanged."""
     return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
 
 
-def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+def checked_values(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Return a scalar or array as float32 array of `shape`. Raises InputError: other shape, or not finite."""
     array = real_array(to_numpy(values), name)
     if array.ndim and array.shape != shape:
@@ -171,7 +135,7 @@ def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray
     return np.ascontiguousarray(np.broadcast_to(array, shape))
 
 
-def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
+def checked_skill(skill: object, num_envs: int, num_skills: int) -> np.ndarray:
     """Check task indices, and return one for each world, (num_envs,) int32.
 
     skill: one index for all worlds, or (num_envs,). Raises InputError: not integers from 0 to num_skills - 1.
@@ -184,7 +148,7 @@ def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(array.astype(np.int32), num_envs))
 
 
-def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
+def checked_mask(worlds: object, num_envs: int) -> np.ndarray:
     """Convert a bool mask of worlds, (num_envs,) or None for all, to a float32 mask, 1 in selected worlds.
 
     Raises InputError: another shape or type.
@@ -197,7 +161,7 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
+def checked_worlds(worlds: object, num_envs: int) -> np.ndarray:
     """Convert a bool mask, (num_envs,), or distinct indices of worlds to a float32 mask, 1 in selected worlds.
 
     Raises InputError: neither of them.
@@ -213,13 +177,15 @@ def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
     return mask
 
 
-def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
+def checked_commands(commands: object, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
     """Check that commands are valid for a task, and return them as float32 (num_envs, 4), padded with zeros.
 
     mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
-    array, n, errors = real_array(to_numpy(commands), "commands"), len(mask), []
+    array = real_array(to_numpy(commands), "commands")
+    n = len(mask)
+    errors = []
     for task in tasks:
         try:
             task.command.check(array, task.name, mask > 0.0)

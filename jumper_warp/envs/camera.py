@@ -11,7 +11,6 @@ import warp as wp
 
 from jumper_warp.robot.model import GROUND_COLOR, build_model
 from jumper_warp.sim.dynamics import find_ground
-from jumper_warp.sim.links import LinkReader
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.viz.film import DIRECTION
@@ -36,8 +35,10 @@ class WorldCamera:
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
         """Prepare images of the first `count` worlds; size: width and height [px]."""
-        self._count, self._size, self._links = count, size, LinkReader(sim)
-        self._ground = sim.physics.dynamics.robot.ground
+        self._count = count
+        self._size = size
+        self._sim = sim
+        self._ground = sim.dynamics.robot.ground
         shape = find_ground(sim.model)
         self._is_field = shape >= 0 and sim.model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD)
         self._heights = self._ground.heights.numpy()
@@ -53,7 +54,7 @@ class WorldCamera:
 
     def images(self) -> list[np.ndarray]:
         """Return an image of each world's current state, (height, width, 3) uint8, RGB. Waits for the device."""
-        links = self._links.read()[0][: self._count].astype(float)
+        links = self._sim.links()[0][: self._count].astype(float)
         self._follow(links[:, 0, :3])
         scenery, blocks = self._present_scenery()
         renderer = self._renderer_of(scenery)
@@ -78,13 +79,16 @@ class WorldCamera:
 
         Columns: origin x, y of the drawn part of a heightfield; half extents x, y and height of the block, or 0.
         """
-        scenery, centers = np.zeros((self._count, 5)), np.zeros((self._count, 2))
+        scenery = np.zeros((self._count, 5))
+        centers = np.zeros((self._count, 2))
         if self._is_field:
             scenery[:, :2] = self._origins
         if self._ground.blocks.shape[0]:
             blocks = self._ground.blocks.numpy()[: self._count]
-            exists, centers = blocks["exists"] != 0, blocks["center"].astype(float)
-            scenery[exists, 2:4], scenery[exists, 4] = blocks["half"][exists], blocks["height"][exists]
+            exists = blocks["exists"] != 0
+            centers = blocks["center"].astype(float)
+            scenery[exists, 2:4] = blocks["half"][exists]
+            scenery[exists, 4] = blocks["height"][exists]
         return scenery, centers
 
     def _renderer_of(self, scenery: np.ndarray) -> Renderer:
@@ -100,7 +104,8 @@ class WorldCamera:
 
     def _scenery_shapes(self, scenery: np.ndarray) -> list[ShapeMesh]:
         """Return the shapes of every world's scenery; bodies after the links: heightfield and block of each world."""
-        builder, bodies = newton.ModelBuilder(), []
+        builder = newton.ModelBuilder()
+        bodies = []
         builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(has_shape_collision=False)
         for rank, (x, y, half_x, half_y, height) in enumerate(scenery):
             body = self._num_links + 2 * rank
@@ -123,7 +128,8 @@ class WorldCamera:
         Beyond the rim the heights are those of the rim, as in the simulation.
         """
         axes = []
-        ground, (rows, cols) = self._ground, self._heights.shape
+        ground = self._ground
+        rows, cols = self._heights.shape
         for point, center, half, count in ((y, ground.center_y, ground.half_y, rows),
                                            (x, ground.center_x, ground.half_x, cols)):  # fmt: skip
             cell = 2.0 * half / (count - 1)
@@ -139,10 +145,13 @@ class WorldCamera:
     def _image(self, renderer: Renderer, rank: int, links: np.ndarray, block: np.ndarray) -> np.ndarray:
         """Draw a world, and return its image; links: poses (21, 7), block: centre (2,) [m], world frame."""
         poses = np.zeros((self._num_links + 2 * self._count, 7))
-        poses[:, 6], poses[self._num_links :, 2] = 1.0, BELOW
-        origin, body = self._origins[rank], self._num_links + 2 * rank
+        poses[:, 6] = 1.0
+        poses[self._num_links :, 2] = BELOW
+        origin = self._origins[rank]
+        body = self._num_links + 2 * rank
         poses[: self._num_links] = links
         poses[: self._num_links, :2] -= origin
-        poses[body : body + 2, 2], poses[body + 1, :2] = 0.0, block - origin
+        poses[body : body + 2, 2] = 0.0
+        poses[body + 1, :2] = block - origin
         target = self._targets[rank] - [*origin, 0.0]
         return renderer.draw(poses, View(target + self._offset.eye, target + self._offset.target))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
+import newton
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import ArrayLike
 
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
@@ -16,12 +18,10 @@ from jumper_warp.envs.arrays import (
     checked_action,
     checked_commands,
     checked_mask,
-    checked_tasks,
     checked_values,
     checked_worlds,
-    prepared_tasks,
 )
-from jumper_warp.envs.stages import Stages, usual_kernels
+from jumper_warp.envs.stages import Stages, WorldSlice, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
@@ -29,13 +29,12 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.sim.dynamics import advance_kernel
-from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
-from jumper_warp.sim.slices import SlicedGraph
-from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg
+from jumper_warp.sim.dynamics import WorldRange, advance_kernel
+from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
+from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg, checked_tasks
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
-from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
+from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of, with_own_ranges
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_flags, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
@@ -45,6 +44,7 @@ from jumper_warp.utils.runtime import init_warp
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
 
+Values = ArrayLike | torch.Tensor  # Numbers, lists, arrays or tensors
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
 
@@ -88,7 +88,7 @@ class Env(Stages):
         noise: bool = True,
         auto_reset: bool = True,
         visuals: bool = False,
-        ground: Any = "plane",
+        ground: str | newton.Heightfield | None = "plane",
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
@@ -108,18 +108,28 @@ class Env(Stages):
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
         """
-        num_envs, refine, seed = check_count("num_envs", num_envs), check_count("refine", refine), check_seed(seed)
+        num_envs = check_count("num_envs", num_envs)
+        refine = check_count("refine", refine)
+        seed = check_seed(seed)
         check_flags(randomize=randomize, noise=noise, auto_reset=auto_reset)
         if stream not in PURPOSES:
             raise InputError(f"stream must be one of {', '.join(PURPOSES)}, got {stream!r:.40}")
         self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
-        self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self.overlay, self.conditions = tuple(handovers), robot, (bool(randomize), bool(noise))
+        self.task = tasks[0]
+        self.tasks = tasks
+        self.num_envs = num_envs
+        self.seed = seed
+        self.auto_reset = auto_reset
+        self.handovers = tuple(handovers)
+        self.overlay = robot
+        self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         if robot is not None and not isinstance(robot, RobotOverlay):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
-        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
+        own = [with_own_ranges(each, robot) if randomize else each for each in tasks]
+        run = [each.in_conditions(randomize=randomize, noise=noise, ground_may_vary=may_vary) for each in own]
+        self._draws_ground = any(each.draws_ground for each in run)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         init_warp()
@@ -137,9 +147,13 @@ class Env(Stages):
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
         if self._draws_ground:
-            self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
-        self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
-        self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
+            self.sim.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
+        self.physics_dt = self.sim.dt
+        self.step_dt = self.sim.dt * self.sim.substeps
+        self._ends_episodes = True
+        self._started = False
+        self._compiled = False
+        self._graphs = {}
         self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
@@ -148,11 +162,16 @@ class Env(Stages):
 
         Observations and reward terms are the first task's.
         """
-        self.num_actions, self.actions = 12, wp.to_torch(self._action)
-        self.action, first = self.actions[0], self.skills[0]
-        self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
-        self.final_obs, self.final_critic_obs = first.final_obs["actor"], first.final_obs["critic"]
-        self.num_obs, self.num_critic_obs = self.obs.shape[1], self.critic_obs.shape[1]
+        self.num_actions = 12
+        self.actions = wp.to_torch(self._action)
+        self.action = self.actions[0]
+        first = self.skills[0]
+        self.obs = first.obs["actor"]
+        self.critic_obs = first.obs["critic"]
+        self.final_obs = first.final_obs["actor"]
+        self.final_critic_obs = first.final_obs["critic"]
+        self.num_obs = self.obs.shape[1]
+        self.num_critic_obs = self.critic_obs.shape[1]
         terms = wp.to_torch(first.term_value)
         self.reward_terms = {term.name: terms[i] for i, term in enumerate(first.task.rewards)}
         names = ("reward", "done", "timeout", "terminated", "truncated")
@@ -160,7 +179,9 @@ class Env(Stages):
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
     @locked
-    def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def reset(
+        self, seed: int | None = None, *, worlds: Values | None = None
+    ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return (observations by group, extras), extras being empty.
 
         seed: restart all random streams and the curriculum as in a new environment with this seed; graphs captured
@@ -241,6 +262,31 @@ class Env(Stages):
             self._graphs[resets].replay()
         return self._step
 
+    def _launch_step(self, worlds: WorldRange | None = None) -> None:
+        """Launch all stages of a policy step for a range of worlds (default: all)."""
+        for stage in self.stages(worlds).values():
+            stage()
+
+    def _advance_physics(self, part: WorldSlice) -> None:
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
+        delays = self.delays
+        self.sim.advance(
+            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
+            worlds=WorldRange(part.first, part.count),
+        )  # fmt: skip
+        self._track(part)
+
+    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
+        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
+
+        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
+        """
+        part = self._part(worlds)
+        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance_physics(part),
+                "episode": lambda: self._compute_rewards_and_dones(part),
+                "observe": lambda: self._observe(part, after_reset=0),
+                "reset": lambda: self._reset_done(part)}  # fmt: skip
+
     def set(self, name: str, value: float, skill: int = 0) -> None:
         """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
@@ -255,16 +301,17 @@ class Env(Stages):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill!r:.40}")
 
     @locked
-    def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
+    def evaluation_reset(self, commands: Values, headings: Values = 0.0, worlds: Values | None = None) -> None:
         """Begin episodes with given commands in the default pose and first task; `step` resets no world until `reset`.
 
         commands: one row a world or one for all, columns as in the `labels` of `Command`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
         Raises InputError (a ValueError): values of another shape, out of bounds or, other than policy steps, infinite.
         """
-        n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
+        n = self.num_envs
+        chosen = checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
-        headings = self._array(checked_values(headings, (n,), "headings"))
+        yaws = self._array(checked_values(headings, (n,), "headings"))
         mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
@@ -274,16 +321,16 @@ class Env(Stages):
         self._advance_rng(mask)
         self._restore_first_task(self._part(), mask)
         self._randomize(self._part(), mask)
-        inputs = [mask, headings, self._scene, self._settings, self.episodes.skill, self.robot]
+        inputs = [mask, yaws, self._scene, self._settings, self.episodes.skill, self.robot]
         self._launch(default_pose_kernel, n, inputs)
         self._clear_history(self._part(), mask)
-        self._set_commands(mask, 1, values, headings)
+        self._set_commands(mask, 1, values, yaws)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
         self.episodes.done.zero_()
 
     @locked
-    def command(self, commands: Any, worlds: Any = None) -> None:
+    def command(self, commands: Values, worlds: Values | None = None) -> None:
         """Set the tasks' commands (such as goals or velocities) within running episodes, and update `obs`.
 
         commands: as in `evaluation_reset`, relative to the current base position and yaw; worlds: (num_envs,) bool, by
@@ -294,7 +341,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=1)
 
     @locked
-    def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
+    def request(self, skill: int, worlds: Values | None = None, commands: Values | None = None) -> None:
         """Request that worlds switch to another skill as soon as the condition of a handover holds.
 
         skill: index of the task. worlds: (num_envs,) bool, by default all. commands: as in `evaluation_reset`, set at
@@ -302,7 +349,8 @@ class Env(Stages):
         Raises InputError (a ValueError): no such skill, or commands of another shape, out of bounds or not finite.
         """
         self._check_skill(skill)
-        mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
+        mask = checked_mask(worlds, self.num_envs)
+        values = np.zeros((self.num_envs, 4), dtype=np.float32)
         if commands is not None:
             values = checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
@@ -332,13 +380,15 @@ class Env(Stages):
     @locked
     def snapshot(self) -> Snapshot:
         """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
-        sim, n = self.sim, self.num_envs
-        past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
+        sim = self.sim
+        n = self.num_envs
+        past = wp.to_torch(self.delays.target_history)
+        step_count = wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
-        dynamics = sim.physics.dynamics
+        dynamics = sim.dynamics
         return Snapshot(
             tasks=tuple(skill.task for skill in self.skills),
-            solver=type(sim.solver).__name__,
+            solver=sim.dynamics.solver_name,
             blocks=dynamics.robot.ground.blocks.shape[0] > 0,
             model=sim.model,
             dt=sim.dt,
@@ -398,7 +448,7 @@ class Env(Stages):
             "physics_dt_s": self.physics_dt,
             "policy_dt_s": self.step_dt,
             "contact_tolerance_m_s": CONTACT_TOLERANCE,
-            "solver": type(self.sim.solver).__name__,
+            "solver": self.sim.dynamics.solver_name,
             "randomize": self.conditions[0],
             "noise": self.conditions[1],
             "quaternion_order": "xyzw",

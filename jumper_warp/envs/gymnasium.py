@@ -61,12 +61,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: see the class; the modes' values "SameStep", "NextStep", "Disabled" are accepted too.
         render_mode: "rgb_array", or None to draw nothing. render_size: width and height of an image [px]. render_envs:
         number of worlds drawn, from the first on.
-        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another autoreset_mode or
-        render_mode, a size outside 16 to 7680 px, or render_envs no whole number of at least 1.
+        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another render_mode, a
+        size outside 16 to 7680 px, or render_envs no whole number of at least 1. ValueError: another autoreset_mode.
         """
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
-        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         _check_size(render_size)
         render_envs = check_count("render_envs", render_envs)
         check_flags(all_groups=all_groups, tensors=tensors)
@@ -74,11 +74,17 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError("Gymnasium's adapter needs an environment with auto_reset")
         if len(env.tasks) > 1:
             raise InputError(f"Gymnasium's adapter needs an environment of one task, this one has {len(env.tasks)}")
-        self.env, self.num_envs, self.device = env, env.num_envs, env.device
+        self.env = env
+        self.num_envs = env.num_envs
+        self.device = env.device
         self.metadata = {**RENDERING, "autoreset_mode": self.autoreset_mode}
         self.endings = env.task.termination_names
-        self._all_groups, self.tensors, self._was_reset = all_groups, tensors, False
-        self.render_mode, self._size, self._drawn = render_mode, render_size, min(render_envs, self.num_envs)
+        self._all_groups = all_groups
+        self.tensors = tensors
+        self._was_reset = False
+        self.render_mode = render_mode
+        self._size = render_size
+        self._drawn = min(render_envs, self.num_envs)
         self._to_reset = None if self.autoreset_mode is AutoresetMode.SAME_STEP else env.use_reset_mask()
         self._ended = self._converted(torch.zeros(self.num_envs, dtype=torch.bool, device=self.device))
         """(num_envs,) bool, worlds whose episode the last step ended."""
@@ -110,8 +116,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             seed %= MOST_SEED + 1
         obs, _ = self.env.reset(seed, worlds=mask)
         begun = self._ended | True if mask is None else mask
-        self._ended, self._was_reset = self._ended & ~begun, True
-        self._sums, self._last_time = self._sums * ~begun, time.perf_counter()
+        self._ended = self._ended & ~begun
+        self._was_reset = True
+        self._sums = self._sums * ~begun
+        self._last_time = time.perf_counter()
         return self._observation(obs), {}
 
     def step(self, actions: Any) -> tuple[Obs, Any, Any, Any, dict[str, Any]]:
@@ -137,7 +145,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = ended = terminated | truncated
         if self._to_reset is None:
             now = time.perf_counter()
-            self._increments[0], self._increments[2], self._last_time = reward, now - self._last_time, now
+            self._increments[0] = reward
+            self._increments[2] = now - self._last_time
+            self._last_time = now
             self._sums += self._increments
         infos = self._infos(step.extras["final_obs"], ended) if self.tensors or ended.any() else {}
         return self._observation(step.obs), reward, terminated, truncated, infos
@@ -147,7 +157,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         termination = self._converted(self._termination.where(torch.as_tensor(ended, device=self.device), -1))
         if self._to_reset is not None:
             return {"termination": termination, "_termination": _copied(ended)}
-        final, episodes = self._observation(final_obs), self._sums * ended
+        final = self._observation(final_obs)
+        episodes = self._sums * ended
         self._sums -= episodes
         lengths = episodes[1].long() if isinstance(episodes, torch.Tensor) else episodes[1].astype(np.int64)
         return {
@@ -210,7 +221,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def _checked_actions(self, actions: Any) -> torch.Tensor:
         """Return actions as a float32 tensor on the device. Raises InputError: another shape, or not numbers."""
-        array, shape = np.asarray(actions), self.action_space.shape
+        array = np.asarray(actions)
+        shape = self.action_space.shape
         if array.shape != shape or array.dtype.kind not in "fiu":
             raise InputError(f"actions must be numbers of shape {shape}, got {array.dtype} of shape {array.shape}")
         return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.env.device)
@@ -251,8 +263,10 @@ class GymEnv(gymnasium.Env):
         if env.num_envs != 1:
             raise InputError(f"gymnasium.make needs one world, got {env.num_envs}; gymnasium.make_vec takes num_envs")
         self._envs = GymVectorEnv(env, autoreset_mode=AutoresetMode.DISABLED, **arguments)
-        self.metadata, self.render_mode = dict(RENDERING), self._envs.render_mode
-        self.observation_space, self.action_space = self._envs.single_observation_space, self._envs.single_action_space
+        self.metadata = dict(RENDERING)
+        self.render_mode = self._envs.render_mode
+        self.observation_space = self._envs.single_observation_space
+        self.action_space = self._envs.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin a new episode; return (observation, infos), infos being empty. See `GymVectorEnv.reset`."""
@@ -279,15 +293,6 @@ class GymEnv(gymnasium.Env):
 def _first(obs: Obs) -> Any:
     """Return the first world's observation, from observations of all worlds."""
     return {group: values[0] for group, values in obs.items()} if isinstance(obs, dict) else obs[0]
-
-
-def _checked_mode(mode: Any) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode from the enum's member or value. Raises InputError: there is no such mode."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError as error:
-        modes = ", ".join(repr(each.value) for each in AutoresetMode)
-        raise InputError(f"autoreset_mode must be one of {modes}, got {mode!r:.40}") from error
 
 
 def _check_size(size: tuple[int, int]) -> None:

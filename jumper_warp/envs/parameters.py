@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -13,6 +11,7 @@ from jumper_warp.sim.dynamics import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
+from jumper_warp.utils.kernels import KernelStruct
 
 MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
@@ -27,13 +26,15 @@ NOMINAL = {
 
 def robot_parameters(
     sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array, moves: RangeMoves | None = None
-) -> Any:  # fmt: skip
+) -> KernelStruct:  # fmt: skip
     """Return the arrays of robot parameters that domain randomisation writes, as views of a simulation's arrays.
 
     The model's current values become the nominal ones. skill: (num_worlds,) int, index in `tasks` of each world's
     active task. moves: differences of the robot from the described one, None for the described one.
     """
-    model, n, device = sim.model, sim.num_worlds, sim.device
+    model = sim.model
+    n = sim.num_worlds
+    device = sim.device
     robot = RobotParameters()
     for name in MODEL:
         setattr(robot, name, getattr(model, name))
@@ -43,8 +44,10 @@ def robot_parameters(
         setattr(robot, f"nominal_{short}", wp.array(first_world, dtype=array.dtype, device=device))
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
-    robot.static_ratio = sim.physics.dynamics.static_friction_ratio
-    robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
+    robot.static_ratio = sim.dynamics.static_friction_ratio
+    robot.motors = sim.motors
+    robot.physics_dt = sim.dt
+    robot.skill = skill
     overlay = sim.robot
     latency = 0 if overlay is None else round(float(overlay.latency[0, 0]) / sim.dt)
     robot.latency = wp.full(n, latency, dtype=int, device=device)
@@ -69,5 +72,6 @@ def robot_parameters(
     moves = RangeMoves() if moves is None else moves
     robot.motor_friction_move = wp.array(np.array(moves.motor_friction), dtype=float, device=device)
     robot.friction_move = wp.vec2(moves.dynamic_friction, moves.static_friction)
-    robot.latency_move, robot.zero_latency = 1.0e-3 * moves.latency, 1.0e-3 * moves.zero_latency
+    robot.latency_move = 1.0e-3 * moves.latency
+    robot.zero_latency = 1.0e-3 * moves.zero_latency
     return robot

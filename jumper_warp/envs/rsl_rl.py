@@ -34,7 +34,8 @@ class RslRlVecEnv(RslRlEnv):
             steps per iteration they are logged once per iteration. max_episode_length: policy steps; only reported.
         """
         self.env = env
-        self.num_envs, self.num_actions = env.num_envs, env.num_actions
+        self.num_envs = env.num_envs
+        self.num_actions = env.num_actions
         self.max_episode_length = max_episode_length
         self.device = env.device
         self.cfg = EnvConfig(env.config())

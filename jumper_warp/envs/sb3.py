@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.utils.errors import InputError
@@ -27,7 +28,8 @@ class Sb3VecEnv(VecEnv):
         """
         if envs.tensors or envs.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise InputError("Stable-Baselines3 needs arrays and autoreset_mode 'SameStep'")
-        self.envs, self._actions = envs, np.zeros(0)
+        self.envs = envs
+        self._actions = np.zeros(0)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
@@ -64,22 +66,24 @@ class Sb3VecEnv(VecEnv):
         """Return an image of every world's robot, see `GymVectorEnv.render`."""
         return self.envs.render() or [None] * self.num_envs
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         """Return the vector environment's attribute once for each of the worlds `indices`, by default all."""
         return [getattr(self.envs, attr_name)] * self._count(indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the vector environment; the worlds share it."""
         setattr(self.envs, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: object
+    ) -> list[object]:
         """Call a method of the vector environment once; return its result for each of the worlds `indices`."""
         return [getattr(self.envs, method_name)(*method_args, **method_kwargs)] * self._count(indices)
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: object, indices: VecEnvIndices = None) -> list[bool]:
         """Return False for each of the worlds `indices`, by default all, as no world has a wrapper of its own."""
         return [False] * self._count(indices)
 
-    def _count(self, indices: Any) -> int:
+    def _count(self, indices: VecEnvIndices) -> int:
         """Return the number of worlds that `indices` selects."""
         return len(list(self._get_indices(indices)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,11 +21,13 @@ from jumper_warp.kernels.mdp.step import make_step_kernel
 from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.copying import Struct
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.dumps import NonFiniteValue
-from jumper_warp.utils.kernels import Kernel, content_hash, records
+from jumper_warp.utils.kernels import Kernel, KernelStruct, content_hash, records
 from jumper_warp.utils.threads import locked
 
+T = TypeVar("T")
 _KERNELS: dict[tuple, Kernel] = {}
 
 
@@ -37,13 +39,17 @@ class TaskRuntime:
     """
 
     def __init__(
-        self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any, slices: int = 1
+        self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: wp.DeviceLike,
+        slices: int = 1,
     ) -> None:  # fmt: skip
         """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`.
 
         slices: number of slices of worlds.
         """
-        self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
+        self.task = task
+        self.index = index
+        self.num_envs = num_envs
+        self.device = device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)
         self.states = wp.zeros(num_envs, dtype=task.state, device=device)
@@ -58,16 +64,18 @@ class TaskRuntime:
         self._allocate_observations(substeps)
         self._allocate_non_finite(slices)
 
-    def _counters(self) -> Any:
+    def _counters(self) -> KernelStruct:
         """Return the counters of episode statistics for the kernels, all 0."""
-        n, task, counters = self.num_envs, self.task, Counters()
+        n = self.num_envs
+        task = self.task
+        counters = Counters()
         allocate(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
         allocate(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
         allocate(counters, ("curriculum_episodes", "curriculum_successes", "bad_actions"), n, int, self.device)
         allocate(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
-    def _structs(self, values: list, kind: Any = None) -> wp.array:
+    def _structs(self, values: list, kind: Struct | None = None) -> wp.array:
         """Return kernel structs (settings or curriculum levels) as a Warp array of type `kind`.
 
         If there are none, it has one unused `NoSettings`.
@@ -77,13 +85,18 @@ class TaskRuntime:
 
     def _allocate_observations(self, substeps: int) -> None:
         """Allocate observation arrays, their torch views by group, and a table of each component's settings."""
-        n, task = self.num_envs, self.task
+        n = self.num_envs
+        task = self.task
         layouts = {group: task.layout(group) for group in task.groups}
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
-        columns, start, past = [], 0, 0
+        columns = []
+        start = 0
+        past = 0
         for index, group in enumerate(task.groups):
             for slot in task.params.slots[f"observations.{group}"]:
-                width, oldest, delayed = slot.term.width, layouts[group][slot.term.name][0], int(slot.delayed)
+                width = slot.term.width
+                oldest = layouts[group][slot.term.name][0]
+                delayed = int(slot.delayed)
                 for j in range(width):
                     columns.append((len(columns), index, start, widths[group], slot.noise, slot.noise_limit, slot.scale,
                                     slot.clip, oldest + j, width, slot.history, delayed, past))  # fmt: skip
@@ -103,7 +116,8 @@ class TaskRuntime:
 
     def _allocate_non_finite(self, slices: int) -> None:
         """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms."""
-        task, groups = self.task, self.task.groups
+        task = self.task
+        groups = self.task.groups
         slots = [(group, slot.term) for group in groups for slot in task.params.slots[f"observations.{group}"]]
         self._term_names = [f"rewards.{term.name}" for term in task.rewards]
         self._term_names += [f"curriculum.{task.curriculum.name}", "terminations.diverged"]
@@ -111,8 +125,10 @@ class TaskRuntime:
         components = [f"{group}.{name}" for group, term in slots for name in term.columns[-term.width :]]
         self._names = {"rewards": [term.name for term in task.rewards], "observations": components}
         self._reported: set[int] = set()
-        found, rows = NonFinite(), slices * len(self._term_names)
-        found.num_rewards, found.num_terms = len(task.rewards), len(self._term_names)
+        found = NonFinite()
+        rows = slices * len(self._term_names)
+        found.num_rewards = len(task.rewards)
+        found.num_terms = len(self._term_names)
         found.world = wp.full(rows, NO_WORLD, dtype=int, device=self.device)
         allocate(found, ("step",), rows, int, self.device)
         allocate(found, ("value",), rows, float, self.device)
@@ -121,7 +137,8 @@ class TaskRuntime:
             allocate(found, (name,), (rows, columns), float, self.device)
         widths = [term.width for _, term in slots]
         found.observation_term = wp.array(np.repeat(np.arange(len(slots)), widths), dtype=int, device=self.device)
-        self.found, self.found_states = found, wp.zeros(rows, dtype=task.state, device=self.device)
+        self.found = found
+        self.found_states = wp.zeros(rows, dtype=task.state, device=self.device)
 
     def non_finite(self) -> list[NonFiniteValue]:
         """Return the first non-finite value of each term, without terms of earlier calls (waits for the device)."""
@@ -130,8 +147,10 @@ class TaskRuntime:
         if not terms:
             return []
         self._reported |= set(terms)
-        found, states = self.found, records(self.found_states)
-        steps, values = found.step.numpy().reshape(worlds.shape), found.value.numpy()
+        found = self.found
+        states = records(self.found_states)
+        steps = found.step.numpy().reshape(worlds.shape)
+        values = found.value.numpy()
         values_by_term = []
         for i in terms:
             first = min(np.flatnonzero(worlds[:, i] != NO_WORLD), key=lambda part: (steps[part, i], worlds[part, i]))
@@ -148,13 +167,15 @@ class TaskRuntime:
 
     def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
         """Return torch views (num_envs, columns) of observations by group; array: flat, group after group."""
-        flat, first, views = wp.to_torch(array), 0, {}
+        flat = wp.to_torch(array)
+        first = 0
+        views = {}
         for group, width in widths.items():
             views[group] = flat[first : first + self.num_envs * width].view(self.num_envs, width)
             first += self.num_envs * width
         return views
 
-    def settings_of_skill(self) -> Any:
+    def settings_of_skill(self) -> KernelStruct:
         """Return the task's constants as a kernel struct: action scale, command filter, collision margins."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
@@ -184,7 +205,9 @@ class TaskRuntime:
         `Episode_Termination/<term>`: fraction of the ended episodes. `Metrics/success`: fraction of the episodes that
         the curriculum counts; `Metrics/error_of_successes_<unit>`: mean curriculum error of the successful ones.
         """
-        task, counters, metrics = self.task, self.counters, {}
+        task = self.task
+        counters = self.counters
+        metrics = {}
         endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
         limit = self._max_episode_length_s
@@ -207,7 +230,8 @@ class TaskRuntime:
 
         A `StateMetric` is the sum of `field` over the sum of `per`, or the mean; values that are not finite count as 0.
         """
-        metrics, values_by_name = self.task.metrics, {}
+        metrics = self.task.metrics
+        values_by_name = {}
         if not metrics:
             return values_by_name
         states = records(self.states).copy()
@@ -248,7 +272,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     }
 
 
-def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
+def _kernel(make: Callable[[T], Kernel], source: T, *key_parts: object) -> Kernel:
     """Return the kernel that `make` builds from `source`, built once and cached.
 
     Key: `make` and key_parts, all parts of source that the kernel depends on, with the code of their functions.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -27,12 +27,12 @@ from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
+from jumper_warp.sim.dynamics import WorldRange
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
 from jumper_warp.utils.copying import Uncopied
-from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
@@ -59,7 +59,7 @@ class WorldSlice(NamedTuple):
 
     first: int
     count: int
-    episode: Any  # The kernels' `EpisodeArrays` that begin at `first`
+    episode: KernelStruct  # The kernels' `EpisodeArrays` that begin at `first`
 
 
 class Stages(Uncopied):
@@ -84,7 +84,9 @@ class Stages(Uncopied):
 
         moves: differences of the robot from the described one.
         """
-        n, device, sim = self.num_envs, self.wp_device, self.sim
+        n = self.num_envs
+        device = self.wp_device
+        sim = self.sim
         wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
@@ -92,7 +94,8 @@ class Stages(Uncopied):
             TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
         ]
         self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
-        self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
+        self.robot = robot_arrays(sim, self.step_dt)
+        self._scene = scene_of(sim)
         self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
@@ -115,7 +118,7 @@ class Stages(Uncopied):
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
-        self.sim.physics.parameters_changed()
+        self.sim.dynamics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return the kernels of `step`, and of `reset` if draws, else `evaluation_reset`, each with its block size."""
@@ -123,7 +126,7 @@ class Stages(Uncopied):
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
         kernels = usual_kernels([skill.task for skill in self.skills], draws)
-        return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.physics.kernels()]
+        return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.dynamics.step_kernels()]
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""
@@ -132,24 +135,9 @@ class Stages(Uncopied):
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:
             setattr(env, name, getattr(self.episodes, name))
-        env.first, env.slice = worlds.first, self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
+        env.first = worlds.first
+        env.slice = self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
         return WorldSlice(*worlds, env)
-
-    def _launch_step(self, worlds: WorldRange | None = None) -> None:
-        """Launch all stages of a policy step for a range of worlds (default: all)."""
-        for stage in self.stages(worlds).values():
-            stage()
-
-    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
-        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
-
-        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
-        """
-        part = self._part(worlds)
-        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
-                "episode": lambda: self._compute_rewards_and_dones(part),
-                "observe": lambda: self._observe(part, after_reset=0),
-                "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: WorldSlice) -> None:
         """Convert actions to motor targets and wrenches, then run interval events."""
@@ -157,14 +145,9 @@ class Stages(Uncopied):
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
-    def _advance(self, part: WorldSlice) -> None:
-        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
-        delays, scene = self.delays, self._scene
-        self.sim.physics.advance(
-            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
-            worlds=WorldRange(part.first, part.count),
-        )  # fmt: skip
-        inputs = [scene.geometry, scene.ground, self._settings, part.episode, self.robot]
+    def _track(self, part: WorldSlice) -> None:
+        """Update paw kinematics, contacts and collisions after the physics of a policy step."""
+        inputs = [self._scene.geometry, self._scene.ground, self._settings, part.episode, self.robot]
         self._launch(track_kernel, (4, part.count), inputs)
 
     def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
@@ -241,24 +224,26 @@ class Stages(Uncopied):
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
             if due:
                 parallel = self.wp_device.is_cuda and any(slot.parallel for slot in due.values())
-                first, lanes = min(due), events.LANES if parallel else 1
+                first = min(due)
+                lanes = events.LANES if parallel else 1
                 self._launch(
                     skill.kernels["event"], (max(due) - first + 1, lanes, part.count),
                     [skill.index, stage, first, lanes, mask, self.step_dt, part.episode, skill.params.values,
                      skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.update_solver for slot in due.values()):
-                self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
+                self.sim.dynamics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
         """Clear actions, contacts, delays and the solver's warm start where mask is nonzero."""
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
-        self.sim.physics.after_reset(mask)
+        self.sim.dynamics.after_reset(mask)
 
     def _clear_results(self, mask: wp.array) -> None:
         """Clear the last step's reward, reward terms and end flags where mask (num_envs,) is nonzero."""
-        begun, episodes = wp.to_torch(mask) != 0.0, self.episodes
+        begun = wp.to_torch(mask) != 0.0
+        episodes = self.episodes
         for name in ("reward", "done", "timeout", "terminated", "truncated", "termination"):
             wp.to_torch(getattr(episodes, name)).masked_fill_(begun, -1 if name == "termination" else 0)
         for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):

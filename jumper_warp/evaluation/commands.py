@@ -258,7 +258,6 @@ def play_dump(cfg: DumpCfg) -> Path:
 
     found, header = load_dump(cfg.dump)
     from jumper_warp.evaluation.recorder import ankles, save_recording
-    from jumper_warp.sim.links import LinkReader
     from jumper_warp.sim.simulation import Simulation
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
@@ -270,7 +269,7 @@ def play_dump(cfg: DumpCfg) -> Path:
     q, qd = (np.where(np.abs(x) < FARTHEST, x, 0.0) for x in (found.arrays["joint_q"], found.arrays["joint_qd"]))
     sim.state.joint_q.assign(q)  # 0 in place of values that are not finite or cannot be drawn
     sim.state.joint_qd.assign(qd)
-    poses = LinkReader(sim).read()[0]
+    poses = sim.links()[0]
     units = {name: zip(found.names[name], found.arrays[name], strict=True) for name in ("rewards", "observations")}
     series = {f"{group}/{name} [1]": float(value) for group, values in units.items() for name, value in values}
     notes = {"task": header["task"], "term": found.term, "world": found.world, "step": found.step}

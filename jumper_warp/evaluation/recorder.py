@@ -39,11 +39,9 @@ class EnvRecorder:
         sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log.
         """
         from jumper_warp.robot.model import build_model
-        from jumper_warp.sim.links import LinkReader
         from jumper_warp.viz.recorder import Recorder
 
         self.env, self.log, self.worlds = env, log, list(worlds)
-        self.links = LinkReader(env.sim)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
         model = build_model(len(worlds), ground=ground, device=env.wp_device, mujoco=False)
         labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
@@ -55,7 +53,7 @@ class EnvRecorder:
     def __call__(self) -> None:
         """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
         sim, log = self.env.sim, self.log
-        poses = self.links.read()[0][self.worlds]
+        poses = sim.links()[0][self.worlds]
         forces = peak_forces(sim)[self.worlds]
         if self.block is not None:
             self.block_positions.append(block_positions(sim)[self.worlds])
@@ -76,7 +74,7 @@ class EnvRecorder:
         Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
         """
         world, sim = self.worlds[0], self.env.sim
-        peak, torque = sim.physics.peak_paw_force.numpy()[:, world], sim.torque.numpy()[:, world]
+        peak, torque = sim.peak_paw_force.numpy()[:, world], sim.torque.numpy()[:, world]
         action = self.env.action[world].cpu().numpy()
         series = {f"peak paw force/{leg} [N]": peak[i] for i, leg in enumerate(LEGS)}
         series |= {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
@@ -125,7 +123,7 @@ def peak_forces(sim: Simulation) -> np.ndarray:
     force = sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
     size = np.linalg.norm(force, axis=2, keepdims=True)
     direction = np.where(size > 0.0, force / np.where(size > 0.0, size, 1.0), [0.0, 0.0, 1.0])
-    return direction * sim.physics.peak_paw_force.numpy().T[..., None]
+    return direction * sim.peak_paw_force.numpy().T[..., None]
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

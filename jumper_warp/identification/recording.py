@@ -155,14 +155,14 @@ def simulate_plan(
             newer, older = (target[max(now - whole - i, 0) // stride] for i in (0, 1))
             blend = (1.0 - (delay - whole)) * newer + (delay - whole) * older
             delayed_target.assign(blend[:, None].astype(np.float32))
-            sim.physics.advance(1, delayed_target)
+            sim.advance(1, delayed_target)
             if step == 0 and row >= rest:  # the torques at the beginning of this step
                 torque = sim.torque.numpy()[:, 0]
                 rows_read.append(np.concatenate([motor_values(q[7:27]), motor_values(qd[6:26]), torque, q[:7]]))
             if held:
                 _reset_base(sim, held_pose)
     table = np.array(rows_read)[:, :, None]
-    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.diverged.numpy()[0] == 0])
+    valid = np.array([bool(np.isfinite(table).all()) and sim.dynamics.work.diverged.numpy()[0] == 0])
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 
@@ -179,7 +179,7 @@ def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: fl
     height = stance(load_description(), angle[None], np.zeros((1, 12))).height[0]
     q[:3] = [0.0, 0.0, HANGING_HEIGHT if held else height + 1.0e-3]
     sim.state.joint_q.assign(q.astype(np.float32))
-    sim.physics.write_bodies()
+    sim.write_bodies()
     if held:
         weight = np.zeros((sim.model.body_count, 6), dtype=np.float32)
         weight[0, :3] = -HELD_MASS * sim.model.gravity.numpy().reshape(-1, 3)[0]

@@ -17,7 +17,7 @@ from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.sim.slices import WorldRange
+from jumper_warp.sim.dynamics import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 

@@ -20,6 +20,7 @@ from jumper_warp.robot.checks import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.parts import Link, Shape
+from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
@@ -44,6 +45,8 @@ NO_EFFORT_LIMIT = 1.0e6
 """[N m] Effort limit of motor joints, never reached, as motor models saturate torque. Knees: limit of the damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """Indices of a world's eight knees in its 38 `joint_qd`: outer, inner of each leg."""
+MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
+"""Indices of a world's 12 motors in its 38 `joint_qd`."""
 PAWS = tuple(f"{leg}_paw" for leg in LEGS)  # Labels of the paws' shapes, without the world's prefix
 PAW_GROUP = -1  # Collision group of the paws: they collide with the ground, but not with each other
 
@@ -63,6 +66,7 @@ def build_model(
     visuals: bool = True,
     extras: Extras | None = None,
     mujoco: bool = True,
+    robot: RobotValues | None = None,
 ) -> Model:
     """Return a Newton model of `num_worlds` robots, standing in the default pose; labels start with `world_i/`.
 
@@ -79,6 +83,8 @@ def build_model(
             SolverJumper refuses bodies, joints and particles.
         mujoco: Whether to add the attributes of SolverMuJoCo. Without them that solver, which takes a second to
             import, is not imported.
+        robot: Masses, joint constants and paw friction that replace the description's, of one robot (N = 1) or of every
+            world (N = num_worlds).
 
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
@@ -92,12 +98,50 @@ def build_model(
     init_warp()
     description = load_description() if description is None else description
     builder = _empty_builder(gravity, mujoco)
-    robot = _robot_builder(description, friction, _empty_builder(gravity, mujoco), visuals)
+    one = _robot_builder(description, friction, _empty_builder(gravity, mujoco), visuals)
     if extras is not None:
-        extras(robot)
-    builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
+        extras(one)
+    builder.replicate(one, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
-    return cast(Model, builder.finalize(device=device))
+    model = cast(Model, builder.finalize(device=device))
+    if robot is not None:
+        _write_values(model, robot)
+    return model
+
+
+def _write_values(model: Model, robots: RobotValues) -> None:
+    """Replace masses, joint constants and paw friction of a model of the description by those of given robots."""
+    n = model.world_count
+    mass = model.body_mass.numpy().reshape(n, -1)
+    com = model.body_com.numpy().reshape(n, -1, 3)
+    inertia = model.body_inertia.numpy().reshape(n, -1, 3, 3)
+    scale = np.tile(robots.link_mass, (1, 4)) * np.ones((n, 4 * len(LINK_KINDS)))
+    base_ratio = robots.base_mass[:, 0] / mass[:, 0]
+    inertia[:, 0] *= (base_ratio * robots.base_inertia[:, 0])[:, None, None]
+    inertia[:, 1:] *= scale[:, :, None, None]
+    mass[:, 0] = robots.base_mass[:, 0]
+    com[:, 0] = robots.base_com
+    mass[:, 1:] *= scale
+    for array, values in (
+        (model.body_mass, mass),
+        (model.body_inv_mass, 1.0 / mass),
+        (model.body_com, com),
+        (model.body_inertia, inertia),
+        (model.body_inv_inertia, np.linalg.inv(inertia.astype(np.float64))),
+    ):
+        array.assign(np.ascontiguousarray(values, dtype=np.float32).reshape(array.numpy().shape))
+    for array, dofs, values in (
+        (model.joint_armature, MOTOR_DOFS, robots.armature),
+        (model.joint_friction, MOTOR_DOFS, robots.motor_friction),
+        (model.joint_damping, KNEE_DOFS, robots.knee_damping),
+    ):
+        table = array.numpy().reshape(n, -1)
+        table[:, dofs] = values
+        array.assign(table.ravel())
+    friction = model.shape_material_mu.numpy()
+    paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
+    friction[np.reshape(paws, (n, -1))] = robots.paw_friction
+    model.shape_material_mu.assign(friction)
 
 
 def other_colliders(model: Model) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -14,8 +14,10 @@ from jumper_warp.kernels.actuation import command_filter
 from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
-from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_count, check_filter_speed
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 
 OVERSPEED_START, OVERSPEED_END = math.radians(2000.0), math.radians(2500.0)
 """[rad/s] Speeds at which over-speed protection starts to reduce the torque, and at which the torque is 0."""
@@ -117,13 +119,14 @@ def motor_arrays(
     module: ModuleType = actuator,
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
-) -> Any:
-    """Return the motor constants of `num_worlds` equal worlds as a struct of arrays for the kernels.
+    robot: RobotValues | None = None,
+) -> KernelStruct:
+    """Return the motor constants of `num_worlds` worlds as a struct of arrays for the kernels.
 
     Arrays are (12, num_worlds), without sensor offsets. module: `jumper_warp.kernels.actuation.motors` in either
-    precision. Raises InputError for less than one world.
+    precision. robot: factors on gains and torque limits, speeds and sensor offsets of one robot (N = 1) or of every
+    world (N = num_worlds).
     """
-    num_worlds = check_count("num_worlds", num_worlds)
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]
@@ -136,6 +139,12 @@ def motor_arrays(
     motors.offset = per_motor(0.0, 0.0)
     motors.fade_start = cfg.fade_start
     motors.fade_end = cfg.fade_end
+    if robot is not None:
+        for name in ("kp", "kd", "saturation"):
+            array = getattr(motors, name)
+            array.assign((array.numpy() * getattr(robot, name).T).astype(np.float32))
+        for name in ("no_load_speed", "cutoff_speed", "offset"):
+            getattr(motors, name).assign((np.zeros((12, num_worlds)) + getattr(robot, name).T).astype(np.float32))
     return motors
 
 
@@ -201,7 +210,7 @@ def loose_filter() -> FilterCfg:
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 
 
-def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:
+def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> KernelStruct:
     """Return the motor command filter's settings as the struct that the kernels read, angles in radians.
 
     module: `command_filter` in either precision.

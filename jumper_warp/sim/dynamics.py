@@ -1,38 +1,46 @@
 """Dynamics of the quadruped Jumper in dedicated Warp kernels, which work on the arrays of a Newton model.
 
-In single or double precision.
+In single or double precision. Launches for a range of worlds (`WorldRange`) touch no other world: Warp runs a launch on
+one thread of a CPU, so that threads can advance slices of the worlds concurrently. Nothing is summed across worlds:
+results depend neither on the slices nor on the threads.
 """
 
 from __future__ import annotations
 
-import functools
-import importlib
+import itertools
+import math
+import warnings
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.kernels.dynamics.restore import (
+    StateArrays,
+    clear_contact_kernel,
+    rest_blocks_kernel,
+    restore_state_kernel,
+)
+from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import LEGS, RobotDescription, load_description
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import leg_geometry_array
-from jumper_warp.sim.precision import float64_kernels
-from jumper_warp.sim.slices import WorldRange
+from jumper_warp.robot.model import leg_geometry_array, other_colliders
+from jumper_warp.sim.precision import KernelModules, kernel_modules
+from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.newton_types import Model
+from jumper_warp.utils.kernels import Kernel, KernelStruct
+from jumper_warp.utils.newton_types import Model, State
 
+DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
+MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
+MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
+TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
+MIN_WORLDS = 16
+"""Smallest slice: for fewer worlds a thread costs more than it saves, and slices would share cache lines."""
 LINKS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
-KERNEL_MODULES = (
-    "actuation.command_filter", "actuation.motors", "dynamics.adjoint.constants_adjoint",
-    "dynamics.adjoint.gradients", "dynamics.adjoint.leg_record", "dynamics.adjoint.multipliers",
-    "dynamics.adjoint.rollout_adjoint", "dynamics.adjoint.rollout_legs_adjoint", "dynamics.adjoint.step_adjoint",
-    "dynamics.contact", "dynamics.drive", "dynamics.legs.advance_legs",
-    "dynamics.legs.rollout_legs", "dynamics.momentum", "dynamics.parameters", "dynamics.step", "dynamics.trajectory",
-    "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
-    "layout", "scalar", "state", "terrain.ground",
-)  # fmt: skip
 ALONE = "this robot alone, besides shapes and sites"
 
 
@@ -40,35 +48,33 @@ class NotThisRobotError(InputError):
     """Error raised for a Newton model whose bodies, joints or shapes are not those of this robot."""
 
 
-class KernelModules:
-    """Warp kernel modules of the robot's dynamics, in single or double precision.
+class WorldRange(NamedTuple):
+    """Contiguous range of worlds: first, ..., first + count - 1."""
 
-    Each is an attribute, named after the module, for those in `KERNEL_MODULES`; it is imported at its first use.
+    first: int
+    count: int
+
+
+def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
+    """Divide all worlds into at most `threads` slices of about equal size; if several, each has at least MIN_WORLDS."""
+    count = max(1, min(threads, num_worlds // MIN_WORLDS))
+    begins = [MIN_WORLDS * (num_worlds // MIN_WORLDS * i // count) for i in range(count)]
+    return [WorldRange(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]
+
+
+def check_step(dt: float, substeps: int = 1) -> int:
+    """Return `substeps` as int.
+
+    Raises InputError: dt [s] not in the range DT, or substeps no whole number from 1 to MAX_SUBSTEPS.
     """
-
-    def __init__(self, double: bool = False) -> None:
-        """Import no module yet; double: whether the kernels compute in float64."""
-        self._package = float64_kernels().__name__ if double else "jumper_warp.kernels"
-
-    def __getattr__(self, name: str) -> Any:
-        """Import a kernel module by name, and cache it. Raises AttributeError: there is no such module."""
-        for path in KERNEL_MODULES:
-            if path.split(".")[-1] == name:
-                module = importlib.import_module(f"{self._package}.{path}")
-                setattr(self, name, module)
-                return module
-        raise AttributeError(f"no kernel module {name!r}")
-
-
-@functools.cache
-def kernel_modules(double: bool = False) -> KernelModules:
-    """Return the kernel modules of the robot's dynamics; double: whether in float64."""
-    return KernelModules(double)
+    if not DT[0] <= dt <= DT[1]:
+        raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
+    return check_count("substeps", substeps, MAX_SUBSTEPS)
 
 
 def advance_kernel(
     device: wp.Device, modules: KernelModules | None = None, by_legs: bool | None = None
-) -> tuple[wp.Kernel, int]:
+) -> tuple[Kernel, int]:
     """Return the kernel that advances the physics, and its number of threads per block.
 
     modules: default in single precision; by_legs: as in `JumperDynamics.advance`.
@@ -87,17 +93,10 @@ def check_model(model: Model) -> None:
     if count < 1:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for noun, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
-        names = [label.split("/")[-1] for label in labels]
-        unknown = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
-        if unknown is not None and len(names) > count * len(expected):
-            raise NotThisRobotError(f"{noun} {unknown!r:.60} cannot be simulated: every world must hold {ALONE}")
-        if len(names) != count * len(expected):
-            raise NotThisRobotError(
-                f"{count} worlds of this robot have {count * len(expected)} {noun} labels, the model has {len(names)}"
-            )
-        for i, name in enumerate(names):
-            if name != expected[i % len(expected)]:
-                raise NotThisRobotError(f"{noun} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
+        for label, name in itertools.zip_longest(labels, count * expected):
+            if label is None or label.split("/")[-1] != name:
+                found = f"{noun} {label!r:.60} cannot be simulated in place of {name!r}"
+                raise NotThisRobotError(f"{found}: every world must hold {ALONE}")
     for name, size, per_world in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
         if size != count * per_world:
             raise NotThisRobotError(f"{name} must hold {per_world} values a world, found {size / count:g}")
@@ -111,6 +110,17 @@ def check_model(model: Model) -> None:
     for noun, number in unsupported.items():
         if number > 0:
             raise NotThisRobotError(f"{number} {noun} cannot be simulated: every world must hold {ALONE}")
+
+
+def warn_of_colliders(model: Model) -> None:
+    """Emit one UserWarning if the model has colliding shapes that `JumperDynamics` ignores."""
+    ignored = other_colliders(model)
+    if len(ignored) > 0:
+        warnings.warn(
+            f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
+            f"{model.shape_label[ignored[0]]!r:.60}: only paws, ground and blocks have contact",
+            stacklevel=4,  # this function, the constructor, and its lock
+        )
 
 
 def find_paws(model: Model) -> np.ndarray:
@@ -148,7 +158,7 @@ def find_ground(model: Model) -> int:
     return int(grounds[0])
 
 
-def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
+def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> KernelStruct:
     """Return the ground of a Newton model, a plane or heightfield, as the struct that the contact kernels read.
 
     shape: index from `find_ground`; for -1 a plane that nothing reaches.
@@ -176,7 +186,8 @@ def block_array(cfg: BlockCfg | None, num_worlds: int, modules: KernelModules, d
     """
     block = modules.ground.Block
     fields = {} if cfg is None else cfg.per_world(num_worlds)
-    values: Any = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
+    layout: Any = block.numpy_dtype()
+    values: Any = np.zeros(num_worlds if fields else 0, dtype=layout)
     for name, value in fields.items():
         values[name] = value
     if fields:
@@ -185,12 +196,27 @@ def block_array(cfg: BlockCfg | None, num_worlds: int, modules: KernelModules, d
     return wp.array(values, dtype=block, device=device)
 
 
+def state_arrays(state: State | Model) -> KernelStruct:
+    """Return the joint and body arrays of a Newton state as the struct that the kernels read.
+
+    For a model: the arrays of its reference pose.
+    """
+    arrays = StateArrays()
+    for name in StateArrays.vars:
+        setattr(arrays, name, getattr(state, name))
+    return arrays
+
+
 class JumperDynamics:
     """Dedicated dynamics of the Jumper for every world of a Newton model: parameters, work arrays and kernel launches.
 
-    `SolverJumper` uses it in single precision. Tests use it in double precision, as the reference for rounding errors
-    and gradients. q, qd: flat arrays of `real` in the layout of `joint_q` (43 a world) and `joint_qd` (38 a world).
+    A `Simulation` and `SolverJumper` use it in single precision. Tests use it in double precision, as the reference for
+    rounding errors and gradients. q, qd: flat arrays of `real` in the layout of `joint_q` (43 a world) and `joint_qd`
+    (38 a world). Arrays are never reallocated; legs FL, FR, BL, BR.
     """
+
+    solver_name = "SolverJumper"
+    sliced = True  # Whether launches support a range of worlds
 
     def __init__(
         self,
@@ -198,18 +224,29 @@ class JumperDynamics:
         *,
         description: RobotDescription | None = None,
         block: BlockCfg | None = None,
+        max_sweeps: int = MAX_SWEEPS,
+        tolerance: float = TOLERANCE,
+        keep_momentum: bool = False,
         double: bool = False,
     ):
         """Read all robot parameters from a Newton model, and allocate the work arrays of the kernels.
 
-        block: a moving block for every world; double: whether in float64. Raises NotThisRobotError: the model is not
-        this robot, InputError: `block` has another number of worlds.
+        block: a moving block for every world; max_sweeps, tolerance [m/s]: end of the contact iteration; keep_momentum:
+        see `follow`; double: whether in float64.
+        Raises NotThisRobotError: the model is not this robot. InputError: `block` has another number of worlds,
+        `max_sweeps` below 1, or `tolerance` not finite and positive.
         """
+        if max_sweeps < 1:
+            raise InputError(f"max_sweeps must be at least 1, got {max_sweeps}")
+        if not 0.0 < tolerance < math.inf:
+            raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
         check_model(model)
         self.model = model
+        self.max_sweeps = max_sweeps
+        self.tolerance = tolerance
         self.description = load_description() if description is None else description
         self.modules = kernel_modules(double)
-        self.real = self.modules.scalar.real
+        self.real: type = self.modules.scalar.real
         self.device = model.device
         self.num_worlds = model.world_count
         self.paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
@@ -229,14 +266,16 @@ class JumperDynamics:
         self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
         self.robot.held = wp.zeros(0, dtype=int, device=self.device)
         self.work = self._workspace()
+        self._momenta = self.momenta() if keep_momentum else None
         self.pack()
 
-    def _workspace(self) -> Any:
+    def _workspace(self) -> KernelStruct:
         """Allocate the arrays that the solver's kernels write, such as impulses, forces and torques, all zero.
 
         The reference pose is the model's `joint_q`. Returned as the kernels' `Workspace`.
         """
-        scalar, n = self.modules.scalar, self.num_worlds
+        scalar = self.modules.scalar
+        n = self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
             (("impulse", "contact_force"), (4, n), scalar.vec3),
@@ -250,9 +289,10 @@ class JumperDynamics:
         work.reference_q = wp.array(self.model.joint_q.numpy(), dtype=scalar.real, device=self.device)
         return work
 
-    def step_record(self, steps: int) -> Any:
+    def step_record(self, steps: int) -> KernelStruct:
         """Allocate zeroed arrays in which backpropagation records up to `steps` time steps that it recomputes."""
-        record, n = self.modules.multipliers.StepRecord(), self.num_worlds
+        record = self.modules.multipliers.StepRecord()
+        n = self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
             shape += () if name in ("base", "inverse") else (4,)
@@ -297,13 +337,25 @@ class JumperDynamics:
 
         mask: (num_worlds,) float, not 0 in worlds to update. worlds: range in which the mask is read, by default all.
         """
-        m, (first, count) = self.model, worlds or (0, self.num_worlds)
+        m = self.model
+        first, count = worlds or (0, self.num_worlds)
         self._launch(
             self.modules.parameters.repack_kernel,
             (count, 25),
             [first, mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self.paws,
              self.ground_shape, m.shape_material_mu, self.static_friction_ratio],
         )  # fmt: skip
+
+    def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
+        """Read masses, joints and friction that were changed in the model.
+
+        mask: (num_worlds,) float, not 0 in changed worlds; None: all worlds, and gravity and springs too. worlds: range
+        in which the mask is read, by default all.
+        """
+        if mask is None:
+            self.pack()
+        else:
+            self.repack(mask, worlds)
 
     def pack_gravity(self) -> None:
         """Copy gravity of every world from the model to the parameter table of the kernels."""
@@ -313,24 +365,36 @@ class JumperDynamics:
         """Copy stiffness and rest length of the springs between knees to the parameter table of the kernels."""
         self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
+    def set_springs(self, stiffness: np.ndarray, length: np.ndarray) -> None:
+        """Set the springs between the knees of each leg: stiffness [N/m] and rest length [m].
+
+        Both (1, 1) for all worlds, or (num_worlds, 1).
+        """
+        values = np.hstack([stiffness, length])
+        self.leg_springs.assign(np.broadcast_to(values, (self.num_worlds, 2)).astype(np.float32))
+        self.pack_springs()
+
+    def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         """Launch a kernel that writes to the table of robot parameters."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
-    def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
-        """Return step size, step count and limits of the contact iteration as the struct that the step kernels read.
+    def settings(self, dt: float, substeps: int, first: int = 0) -> KernelStruct:
+        """Return a new struct of step size dt [s], number of steps and limits of the contact iteration for a launch.
 
-        dt [s]; max_sweeps and tolerance [m/s] end the contact iteration.
+        The kernels' `StepSettings`. first: world of the first thread.
         """
         settings = self.modules.step.StepSettings()
-        settings.dt, settings.substeps = dt, substeps
-        settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
+        settings.dt = dt
+        settings.substeps = substeps
+        settings.max_sweeps = self.max_sweeps
+        settings.tolerance = self.tolerance
+        settings.first = first
         return settings
 
     def drive(
-        self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None,
+        self, joint_f: wp.array, body_f: wp.array, motors: KernelStruct | None = None, target: wp.array | None = None,
         previous: wp.array | None = None, delay: wp.array | None = None,
-    ) -> Any:  # fmt: skip
+    ) -> KernelStruct:  # fmt: skip
         """Return the inputs that drive the robots in a launch, a struct: joint forces, base wrench, motor targets.
 
         The struct is the kernels' `Drive`. joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in
@@ -338,35 +402,62 @@ class JumperDynamics:
         (num_worlds,), they follow `previous`, shaped as target, until the target arrives.
         """
         drive = self.modules.drive.Drive()
-        drive.joint_f, drive.body_f = joint_f, body_f
+        drive.joint_f = joint_f
+        drive.body_f = body_f
         if motors is not None:
-            drive.closed_loop, drive.motors, drive.target = 1, motors, target
+            drive.closed_loop = 1
+            drive.motors = motors
+            drive.target = target
         if delay is not None:
-            drive.previous, drive.delay = previous, delay
+            drive.previous = previous
+            drive.delay = delay
         return drive
 
-    def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that `advance` launches, and its number of threads per block; by_legs: see `advance`."""
-        return advance_kernel(self.device, self.modules, by_legs)
+    def follow(
+        self, state: State, motors: KernelStruct, target: wp.array, dt: float, substeps: int, *,
+        previous: wp.array | None = None, delay: wp.array | None = None, bodies: bool = True,
+        worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """Advance a state by `substeps` physics steps of dt [s], with motors that follow target [rad].
+
+        motors, target, previous, delay: as in `drive`. bodies: whether to write passive joints and bodies of the state,
+        which no step reads. worlds: range to advance, by default all. With `keep_momentum` the base's velocity is
+        corrected at the end, so that gravity alone changes the momentum of a robot in free flight.
+        """
+        q, qd = state.joint_q, state.joint_qd
+        if self._momenta is not None:
+            self.read_momenta(q, qd, self._momenta, worlds)
+        drive = self.drive(self.model.joint_f, state.body_f, motors, target, previous, delay)
+        self.advance(dt, substeps, drive, q, qd, q, qd, worlds)
+        if self._momenta is not None:
+            self.project_momentum(q, qd, self._momenta, state.body_f, dt * substeps, worlds)
+        if bodies:
+            self.full_state(q, qd, state.body_q, state.body_qd, worlds)
+
+    def step_kernels(self) -> list[tuple[Kernel, int]]:
+        """Return the kernels that `follow` launches without bodies, each with its number of threads per block."""
+        momentum = self.modules.momentum
+        projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
+        return [advance_kernel(self.device, self.modules), *(projection if self._momenta is not None else [])]
 
     def advance(
-        self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
-        worlds: WorldRange | None = None, by_legs: bool | None = None,
+        self, dt: float, substeps: int, drive: KernelStruct, q: wp.array, qd: wp.array, q_out: wp.array,
+        qd_out: wp.array, worlds: WorldRange | None = None, by_legs: bool | None = None,
     ) -> None:  # fmt: skip
-        """Advance all robots by `settings.substeps` physics steps.
+        """Advance all robots by `substeps` physics steps of dt [s]; drive: the kernels' `Drive`.
 
         Base and motor coordinates after the steps are written to q_out and qd_out, which may be q and qd. worlds: range
         to advance, by default all. by_legs: whether each leg has a thread (default on a GPU) or each world (default on
         a CPU).
         """
-        settings.first, count = worlds or (0, self.num_worlds)
-        inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
+        first, count = worlds or (0, self.num_worlds)
+        inputs = [self.robot, self.settings(dt, substeps, first), drive, q, qd, self.work]
         by_legs = self.device.is_cuda if by_legs is None else by_legs
-        kernel, block_dim = self.advance_kernel(by_legs)
+        kernel, block_dim = advance_kernel(self.device, self.modules, by_legs)
         dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)  # 8 worlds a warp
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[q_out, qd_out], device=self.device, block_dim=block_dim)
 
-    def momenta(self) -> Any:
+    def momenta(self) -> KernelStruct:
         """Allocate arrays for the linear and angular momentum of every robot, all zero.
 
         Returned as the kernels' `Momenta`: `lin` [kg m/s] and `ang` [kg m^2/s], vec3 of shape (num_worlds,).
@@ -376,7 +467,7 @@ class JumperDynamics:
             setattr(momenta, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
         return momenta
 
-    def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: WorldRange | None = None) -> None:
+    def read_momenta(self, q: wp.array, qd: wp.array, momenta: KernelStruct, worlds: WorldRange | None = None) -> None:
         """Compute the linear and angular momentum of every robot at q, qd, in world axes, and write it to `momenta`.
 
         worlds: range, by default all.
@@ -386,8 +477,9 @@ class JumperDynamics:
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def project_momentum(
-        self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: WorldRange | None = None
-    ) -> None:
+        self, q: wp.array, qd: wp.array, momenta: KernelStruct, body_f: wp.array, time: float,
+        worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
         """Correct the base's velocity in qd so that only gravity changes the momentum of a robot in free flight.
 
         Call it after `advance` by `time` [s]. momenta: before that call. body_f: wrenches during it; a robot with a
@@ -413,3 +505,42 @@ class JumperDynamics:
             outputs=[body_q, body_qd],
             device=self.device,
         )
+
+    def clear_contact(self, mask: wp.array) -> None:
+        """Clear warm starts, contact forces and divergence flags of the worlds in a mask.
+
+        mask: (num_worlds + 1,) bool; the last entry belongs to no world.
+        """
+        outputs = [self.work.impulse, self.work.contact_force, self.work.diverged]
+        wp.launch(clear_contact_kernel, self.num_worlds, [mask], outputs, device=self.device)
+
+    def restore(self, mask: wp.array, start: State | Model, state: State) -> None:
+        """Copy joint and body states of the worlds in a mask from `start`, for a model its reference pose, to `state`.
+
+        mask: bool of shape (num_worlds,) or longer.
+        """
+        inputs, outputs = [mask, state_arrays(start)], [state_arrays(state)]
+        wp.launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, outputs, device=self.device)
+
+    def reset_blocks(self, mask: wp.array) -> None:
+        """Return the moving blocks of the worlds in a mask, bool of shape (num_worlds,) or longer, to their starts."""
+        if self.robot.ground.blocks.shape[0] > 0:
+            wp.launch(rest_blocks_kernel, self.num_worlds, inputs=[mask, self.robot.ground], device=self.device)
+
+    def forget(self, mask: wp.array) -> None:
+        """Clear what a step inherits from the last one (see `clear_contact`), and return blocks to their starts.
+
+        mask: as in `clear_contact`.
+        """
+        self.clear_contact(mask)
+        self.reset_blocks(mask)
+
+    def after_reset(self, mask: wp.array) -> None:
+        """Update the dynamics after joint coordinates were written in worlds whose mask (num_worlds,) is not 0.
+
+        Nothing to do here, as a step reads base and motor coordinates alone.
+        """
+
+    def carried(self) -> dict[str, wp.array]:
+        """Return by name the arrays, besides joint_q, joint_qd and impulses, that the next step depends on: none."""
+        return {}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, cast
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Literal, cast
 
 import newton
 import numpy as np
@@ -11,7 +13,7 @@ import warp as wp
 
 from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
-from jumper_warp.kernels.dynamics.restore import restore_motors_kernel, restore_state_kernel
+from jumper_warp.kernels.dynamics.restore import restore_motors_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
@@ -19,15 +21,16 @@ from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.overlay import write_model, write_motors, write_springs
-from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
-from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
-from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
+from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange, check_step, slices_of, warn_of_colliders
+from jumper_warp.sim.mujoco import MujocoDynamics
+from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked, stop_spinning
+from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.newton_types import State
+from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked, run_in_parallel, stop_spinning
 
 if TYPE_CHECKING:
     import torch
@@ -35,6 +38,54 @@ if TYPE_CHECKING:
 SUBSTEPS = 8  # Physics steps of 1/480 s in a policy step of 1/60 s
 
 SolverName = Literal["jumper", "mujoco"]
+
+
+@functools.cache
+def _capture_stream(device: str) -> wp.Stream:
+    """Return the CUDA stream on which only captures of graphs run; device: torch's name of the device.
+
+    It is a stream of torch, since other threads may not use the default stream while a stream of Warp is captured.
+    """
+    import torch
+
+    return wp.stream_from_torch(torch.cuda.Stream(device))
+
+
+def _on_capture_stream(device: wp.Device) -> AbstractContextManager[object]:
+    """Return a context in which a device captures a graph on a stream that no other thread's work uses."""
+    return wp.ScopedStream(_capture_stream(wp.device_to_torch(device))) if device.is_cuda else nullcontext()
+
+
+class SlicedGraph:
+    """Kernel launches that are captured as one graph for each slice of worlds, and replayed together."""
+
+    @locked
+    def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
+        """Capture the kernel launches of each slice of worlds as a graph.
+
+        launch: function that launches kernels for a slice; their modules must be loaded.
+        """
+        self._device = device
+        self._graphs: list[wp.Graph] = []
+        for worlds in slices:
+            with _on_capture_stream(device), wp.ScopedCapture(device=device) as capture:
+                launch(worlds)
+            assert capture.graph is not None
+            self._graphs.append(capture.graph)
+
+    def replay(self) -> None:
+        """Replay the captured kernel launches of all slices, concurrently on a CPU.
+
+        With several graphs all have ended when this returns.
+        """
+        if self._device.is_cuda:  # one graph; a capture changes the device's stream
+            with WARP_LOCK:
+                wp.capture_launch(self._graphs[0])
+        elif len(self._graphs) == 1:
+            wp.capture_launch(self._graphs[0])
+        else:
+            jobs = [functools.partial(wp.capture_launch, graph) for graph in self._graphs]
+            run_in_parallel(jobs, len(jobs))
 
 
 class Simulation(Uncopied):
@@ -102,59 +153,66 @@ class Simulation(Uncopied):
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):
             raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
-        num_worlds, substeps = check_count("num_worlds", num_worlds), check_step(dt, substeps)
-        check_tolerance(tolerance)
+        num_worlds = check_count("num_worlds", num_worlds)
+        substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
+        self.robot = values = _values_of(robot, friction)
         self.model = build_model(
             num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
-            device=device, mujoco=solver == "mujoco",
+            device=device, mujoco=solver == "mujoco", robot=values,
         )  # fmt: skip
-        self.device, self.num_worlds, self.block = self.model.device, num_worlds, block
-        self.dt, self.substeps = dt, substeps
-        self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device)
-        self.robot = self._write_robot(robot)
+        self.device = self.model.device
+        self.num_worlds = num_worlds
+        self.block = block
+        self.dt = dt
+        self.substeps = substeps
+        self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device, robot=values)
         self._filter = None if command_filter is None else filter_params(command_filter)
         self._make_arrays()
-        self.physics: Physics = (
-            JumperPhysics(self, block, tolerance, keep_momentum)
-            if solver == "jumper"
-            else MujocoPhysics(self, observe_forces)
-        )
-        if self.robot is not None:
-            write_springs(self.physics.dynamics, self.robot)
-        shared = self.physics.sliced and not self.device.is_cuda
+        if solver == "jumper":
+            self.dynamics = JumperDynamics(self.model, block=block, tolerance=tolerance, keep_momentum=keep_momentum)
+            warn_of_colliders(self.model)
+        else:
+            self.dynamics = MujocoDynamics(
+                self.model, self.state, self.control, dt=dt, tolerance=tolerance, observe_forces=observe_forces
+            )
+        if values is not None:
+            self.dynamics.set_springs(values.spring_stiffness, values.spring_length)
+        shared = self.dynamics.sliced and not self.device.is_cuda
         self.slices = slices_of(num_worlds, threads if shared else 1)
         if len(self.slices) > 1:
             stop_spinning()
-        self.solver = self.physics.solver
-        self.torque, self.paw_force = self.physics.torque, self.physics.paw_force
-        self.peak_force = self.physics.peak_force
-        self.physics.write_bodies()
-        start = self.model.state()
-        start.assign(self.state)
-        self._start = state_arrays(start)
+        work = self.dynamics.work
+        self.torque: wp.array = work.torque  # (12, num_worlds) [N m] Motor torques of the last physics step
+        self.paw_force: wp.array = work.contact_force
+        """(4, num_worlds) vec3 [N] Ground forces on the paws in the last physics step, world frame"""
+        self.peak_force: wp.array = work.peak_force
+        """(num_worlds,) [N] Largest total paw force in the last call of `advance`"""
+        self.peak_paw_force: wp.array = work.peak_paw_force
+        """(4, num_worlds) [N] Largest force on each paw in the last call of `advance`"""
+        self.write_bodies()
+        self._start = self.model.state()
+        self._start.assign(self.state)
 
-    def _write_robot(self, robot: RobotOverlay | RobotValues | None) -> RobotValues | None:
-        """Replace model and motor parameters by those of an overlay or of given robots, and return these values.
-
-        None: the described robot.
-        """
-        values = robot.robots() if isinstance(robot, RobotOverlay) else robot
-        if values is not None:
-            paws = not isinstance(robot, RobotOverlay) or "paw_friction" in robot.values
-            write_model(self.model, values, paws=paws)
-            write_motors(self.motors, values)
-        return values
+    @functools.cached_property
+    def solver(self) -> SolverJumper | newton.solvers.SolverMuJoCo:
+        """Newton's interface of the solver, on this simulation's dynamics; steps of the simulation do not use it."""
+        if isinstance(self.dynamics, MujocoDynamics):
+            return self.dynamics.solver
+        return SolverJumper(self.model, dynamics=self.dynamics)
 
     def _make_arrays(self) -> None:
         """Allocate state, control, targets, standing pose, reset mask and readout arrays."""
-        self.state, self.control = self.model.state(), self.model.control()
+        self.state = self.model.state()
+        self.control = self.model.control()
         standing = motor_values(self.model.joint_q.numpy().reshape(self.num_worlds, -1)[:, 7:])
         self._standing = wp.array(standing.T, dtype=float, device=self.device)
-        self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
+        self.target = wp.clone(self._standing)
+        self._safe_target = wp.clone(self._standing)
         self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # last entry: no world
         self._base_velocity = wp.zeros(self.num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
+        self._links: State | None = None  # allocated by `links`
 
     @locked
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
@@ -162,8 +220,9 @@ class Simulation(Uncopied):
 
         Raises InputError: another shape or type, or not finite.
         """
-        array: Any = angles
-        values = real_array(array.detach().cpu() if hasattr(array, "detach") else array, "targets")
+        if hasattr(angles, "detach"):
+            angles = cast("torch.Tensor", angles).detach().cpu()
+        values = real_array(angles, "targets")
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
         if not np.isfinite(values).all():
@@ -184,10 +243,9 @@ class Simulation(Uncopied):
         mask: Worlds to reset, bool of shape (num_worlds,), by default all. Raises InputError for anything else.
         """
         self._take_mask(mask)
-        self.physics.forget(self._mask)
-        inputs = [self._mask, self._start]
-        self._launch(restore_state_kernel, (self.num_worlds, int(COORDS)), inputs, [state_arrays(self.state)])
-        forces = [self.torque, self.paw_force, self.peak_force, self.physics.peak_paw_force]
+        self.dynamics.forget(self._mask)
+        self.dynamics.restore(self._mask, self._start, self.state)
+        forces = [self.torque, self.paw_force, self.peak_force, self.peak_paw_force]
         results = [self.target, self._safe_target, *forces]
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
@@ -199,20 +257,13 @@ class Simulation(Uncopied):
         if mask is None:
             self._mask.fill_(True)
             return
-        array: Any = mask
-        is_tensor = hasattr(mask, "is_cuda")
-        try:
-            array = array if is_tensor or isinstance(array, wp.array) else np.asarray(array)
-            dtype, shape = getattr(array.dtype, "__name__", str(array.dtype)), tuple(array.shape)
-        except ValueError:  # lists of different lengths
-            dtype, shape = "lists", "several lengths"
-        if dtype not in ("bool", "torch.bool") or shape != (self.num_worlds,):
-            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {dtype} of shape {shape}")
-        if is_tensor:
-            array = wp.from_torch(cast("torch.Tensor", array).contiguous())
-        elif isinstance(array, np.ndarray):
-            array = wp.array(array, dtype=wp.bool, device=self.device)
-        wp.copy(self._mask, array, count=self.num_worlds)
+        if hasattr(mask, "is_cuda"):
+            mask = wp.from_torch(cast("torch.Tensor", mask).contiguous())
+        elif not isinstance(mask, wp.array):
+            mask = wp.array(np.asarray(mask), device=self.device)
+        if mask.dtype is not wp.bool or mask.shape != (self.num_worlds,):
+            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {mask.dtype} {mask.shape}")
+        wp.copy(self._mask, mask, count=self.num_worlds)
 
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once, with measured angles (true angle + `motors.offset`).
@@ -224,12 +275,31 @@ class Simulation(Uncopied):
 
     def physics_step(self) -> None:
         """Advance one physics step towards the filtered targets."""
-        self._captured("physics", lambda worlds: self._physics(1, worlds))
+        self._captured("physics", lambda worlds: self.advance(1, self._safe_target, worlds=worlds))
+
+    def advance(
+        self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None, *,
+        bodies: bool = True, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """Launch `substeps` physics steps, with motors that follow target [rad], (12, num_worlds), unfiltered.
+
+        With delay [physics steps], (num_worlds,), they follow `previous` (12, num_worlds) until the target arrives.
+        bodies: whether to write passive joints and bodies of the state. worlds: range to advance, by default all.
+        """
+        self.dynamics.follow(
+            self.state, self.motors, target, self.dt, substeps, previous=previous, delay=delay, bodies=bodies,
+            worlds=worlds,
+        )  # fmt: skip
+
+    def write_bodies(self) -> None:
+        """Compute the state's passive joints, body poses and body velocities from base and motor coordinates."""
+        state = self.state
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def _step(self, worlds: WorldRange) -> None:
         """Launch one policy step (command filter and physics) of a range of worlds."""
         self._filter_targets(worlds)
-        self._physics(self.substeps, worlds)
+        self.advance(self.substeps, self._safe_target, worlds=worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
         """Run kernel launches for all worlds; from the second call of a name on they are replayed as a captured graph.
@@ -267,11 +337,7 @@ class Simulation(Uncopied):
             [self._safe_target],
         )  # fmt: skip
 
-    def _physics(self, substeps: int, worlds: WorldRange) -> None:
-        """Launch `substeps` physics steps of a range of worlds towards the filtered targets."""
-        self.physics.advance(substeps, self._safe_target, worlds=worlds)
-
-    def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         """Launch a kernel on the simulation's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
@@ -284,6 +350,21 @@ class Simulation(Uncopied):
     def joint_qd(self) -> np.ndarray:
         """Return the joint rates, (num_worlds, 38): base [m/s] at its COM, [rad/s], 20 hinges [rad/s], four ankles."""
         return self.state.joint_qd.numpy().reshape(self.num_worlds, -1)
+
+    def links(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return pose (num_worlds, 21, 7) and twist (num_worlds, 21, 6) of every link, world frame.
+
+        They are computed from the joint coordinates; the state does not change. pose: position [m] and quaternion
+        (xyzw); twist: velocity of the COM [m/s] and angular velocity [rad/s]. Waits for the device.
+        """
+        if self._links is None:
+            self._links = self.model.state()
+        state = self._links
+        wp.copy(state.joint_q, self.state.joint_q)
+        wp.copy(state.joint_qd, self.state.joint_qd)
+        self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+        n = self.num_worlds
+        return state.body_q.numpy().reshape(n, -1, 7), state.body_qd.numpy().reshape(n, -1, 6)
 
     @locked
     def base_velocity(self) -> np.ndarray:
@@ -315,6 +396,16 @@ class Simulation(Uncopied):
                 ends.append(frames[body, :3] + rotated)
             gaps.append(np.linalg.norm(ends[0] - ends[1]))
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
+
+
+def _values_of(robot: RobotOverlay | RobotValues | None, friction: float) -> RobotValues | None:
+    """Return a robot's values; the paws of an overlay without `paw_friction` have the given friction coefficient."""
+    if not isinstance(robot, RobotOverlay):
+        return robot
+    values = robot.robots()
+    if "paw_friction" not in robot.values:
+        values.paw_friction[:] = friction
+    return values
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

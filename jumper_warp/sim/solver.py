@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import newton
 import numpy as np
@@ -15,66 +13,14 @@ from newton.solvers import SolverBase
 
 from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
 from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, paw_contacts_kernel
-from jumper_warp.kernels.dynamics.restore import (
-    StateArrays,
-    clear_contact_kernel,
-    rest_blocks_kernel,
-    restore_state_kernel,
-)
-from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import other_colliders
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
-from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.sim.slices import WorldRange
-from jumper_warp.utils.checks import check_count
+from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, WorldRange, check_step, warn_of_colliders
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
-
-DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
-MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
-MAX_SWEEPS = 32  # Largest number of contact sweeps in a step
-TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
-
-
-def check_step(dt: float, substeps: int = 1) -> int:
-    """Return `substeps` as int.
-
-    Raises InputError: dt [s] not in the range DT, or substeps no whole number from 1 to MAX_SUBSTEPS.
-    """
-    if not DT[0] <= dt <= DT[1]:
-        raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
-    return check_count("substeps", substeps, MAX_SUBSTEPS)
-
-
-def check_tolerance(tolerance: float) -> None:
-    """Raise InputError unless the velocity tolerance [m/s] that ends the contact iteration is finite and above 0."""
-    if not 0.0 < tolerance < math.inf:
-        raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
-
-
-def state_arrays(state: State | Model) -> Any:
-    """Return the joint and body arrays of a Newton state as the struct that the kernels read.
-
-    For a model: the arrays of its reference pose.
-    """
-    arrays = StateArrays()
-    arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
-    arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
-    return arrays
-
-
-def warn_of_colliders(model: Model) -> None:
-    """Emit one UserWarning if the model has colliding shapes that SolverJumper ignores."""
-    ignored = other_colliders(model)
-    if len(ignored) > 0:
-        warnings.warn(
-            f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
-            f"{model.shape_label[ignored[0]]!r:.60}: only paws, ground and blocks have contact",
-            stacklevel=4,  # this function, the constructor, and its lock
-        )
 
 
 class SolverJumper(SolverBase):
@@ -118,8 +64,11 @@ class SolverJumper(SolverBase):
         block: BlockCfg | None = None,
         max_sweeps: int = MAX_SWEEPS,
         tolerance: float = TOLERANCE,
+        dynamics: JumperDynamics | None = None,
     ):
         """Prepare the solver for a model of `jumper_warp.robot.model.build_model`.
+
+        dynamics: the model's, if it has some already, such as those of a `Simulation`; the other arguments are theirs.
 
         Raises:
             NotThisRobotError: the model is another robot's, or holds more bodies, joints or particles than it.
@@ -127,13 +76,12 @@ class SolverJumper(SolverBase):
                 not have one row per world.
         """
         super().__init__(model)
-        if max_sweeps < 1:
-            raise InputError(f"max_sweeps must be at least 1, got {max_sweeps}")
-        check_tolerance(tolerance)
-        self.dynamics = JumperDynamics(model, description=description, block=block)
-        warn_of_colliders(model)
-        self.max_sweeps = max_sweeps
-        self.tolerance = tolerance
+        if dynamics is None:
+            dynamics = JumperDynamics(
+                model, description=description, block=block, max_sweeps=max_sweeps, tolerance=tolerance
+            )
+            warn_of_colliders(model)
+        self.dynamics = dynamics
         work = self.dynamics.work
         self.contact_force: wp.array = work.contact_force
         """Force of the ground on each paw (FL, FR, BL, BR) in the last step [N], world frame, (4, num_worlds) vec3."""
@@ -168,7 +116,7 @@ class SolverJumper(SolverBase):
 
     @locked
     def step_motors(
-        self, state_in: State, state_out: State, motors: Any, target: wp.array, dt: float, substeps: int, *,
+        self, state_in: State, state_out: State, motors: KernelStruct, target: wp.array, dt: float, substeps: int, *,
         control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
         bodies: bool = True, observables: SolverBase.Observables | None = None, worlds: WorldRange | None = None,
         contacts: newton.Contacts | None = None,
@@ -215,7 +163,7 @@ class SolverJumper(SolverBase):
         for field, shape in self._state_shapes.items():
             self._check(f"{name}.{field}", getattr(state, field), shape)
 
-    def _check_motors(self, motors: Any, **arrays: wp.array | None) -> None:
+    def _check_motors(self, motors: KernelStruct, **arrays: wp.array | None) -> None:
         """Raise InputError unless the given constants of motors, targets and delay fit the number of worlds."""
         n = self.model.world_count
         for name in MOTOR_CONSTANTS:
@@ -225,7 +173,7 @@ class SolverJumper(SolverBase):
                 self._check(name, array, (n,) if name == "delay" else (12, n))
 
     def _advance(
-        self, state_in: State, state_out: State, drive: Any, dt: float, substeps: int,
+        self, state_in: State, state_out: State, drive: KernelStruct, dt: float, substeps: int,
         observables: SolverBase.Observables | None, bodies: bool, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
         """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
@@ -233,7 +181,8 @@ class SolverJumper(SolverBase):
         self._check_state("state_in", state_in)
         if state_out is not state_in:
             self._check_state("state_out", state_out)
-        qdd, contact_f = state_out.body_qdd, None
+        qdd = state_out.body_qdd
+        contact_f = None
         if observables is not None:
             qdd = qdd if observables.body_qdd is None else observables.body_qdd
             contact_f = observables.contact_f
@@ -244,8 +193,7 @@ class SolverJumper(SolverBase):
         out = (state_out.joint_q, state_out.joint_qd)
         if state_out.joint_q.requires_grad:
             raise InputError("SolverJumper has no gradients on Warp's tape; use jumper_warp.diff.rollout.Rollout")
-        settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
-        self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
+        self.dynamics.advance(dt, substeps, drive, *coordinates, *out, worlds)
         if bodies or qdd is not None or contact_f is not None:
             self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
         if qdd is not None:
@@ -280,17 +228,21 @@ class SolverJumper(SolverBase):
 
         As `update_contacts`. Raises InputError: too few rows.
         """
-        dynamics, n, device = self.dynamics, self.model.world_count, self.model.device
+        dynamics = self.dynamics
+        n = self.model.world_count
+        device = self.model.device
         self._check("state.body_q", state.body_q, self._state_shapes["body_q"])
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
         if dynamics.ground_shape < 0:
             contacts.rigid_contact_count.zero_()
             return
-        rows, shapes = ContactRows(), PawShapes()
+        rows = ContactRows()
+        shapes = PawShapes()
         for name in rows._cls.vars:
             setattr(rows, name, getattr(contacts, f"rigid_contact_{name}"))
-        shapes.paws, shapes.ground = dynamics.paws, dynamics.ground_shape
+        shapes.paws = dynamics.paws
+        shapes.ground = dynamics.ground_shape
         for name in ("body", "transform", "scale"):
             setattr(shapes, name, getattr(self.model, f"shape_{name}"))
         contact_f.zero_()
@@ -325,17 +277,16 @@ class SolverJumper(SolverBase):
         `worlds`: indices, or a mask on the device, bool of shape (num_worlds,) or longer. Raises InputError without
         blocks, or for a shorter mask.
         """
-        n, device = self._blocks().shape[0], self.model.device
-        mask: Any = worlds
+        n = self._blocks().shape[0]
         if isinstance(worlds, wp.array):
-            self._check("worlds", mask[:n], (n,))
-        else:
-            selected = np.zeros(n, dtype=bool)
-            selected[slice(None) if worlds is None else list(worlds)] = True
-            mask = wp.array(selected, dtype=wp.bool, device=device)
-        wp.launch(rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
+            self._check("worlds", cast(wp.array, worlds[:n]), (n,))
+            self.dynamics.reset_blocks(worlds)
+            return
+        selected = np.zeros(n, dtype=bool)
+        selected[slice(None) if worlds is None else list(worlds)] = True
+        self.dynamics.reset_blocks(wp.array(selected, dtype=wp.bool, device=self.model.device))
 
-    def _block_values(self) -> Any:
+    def _block_values(self) -> np.ndarray:
         """Return positions, velocities and properties of all blocks as a structured array, (num_worlds,).
 
         Raises InputError without blocks.
@@ -376,18 +327,13 @@ class SolverJumper(SolverBase):
         starts. With `flags=StateFlags.NONE` state and blocks do not change. Raises InputError: another model's state.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
-        n, device = self.model.world_count, self.model.device
         if world_mask is None:
-            world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
+            world_mask = wp.full(self.model.world_count + 1, True, dtype=wp.bool, device=self.model.device)
         if flags is None or int(flags) != int(StateFlags.NONE):
             self._check_state("state", state)
-        work = self.dynamics.work
-        outputs = [work.impulse, work.contact_force, work.diverged]
-        wp.launch(clear_contact_kernel, dim=n, inputs=[world_mask], outputs=outputs, device=device)
+        self.dynamics.clear_contact(world_mask)
         if flags is not None and int(flags) == int(StateFlags.NONE):
             return
-        if self.dynamics.robot.ground.blocks.shape[0] > 0:
-            self.reset_blocks(world_mask)
-        inputs, outputs = [world_mask, state_arrays(self.model)], [state_arrays(state)]
-        wp.launch(restore_state_kernel, dim=(n, int(COORDS)), inputs=inputs, outputs=outputs, device=device)
+        self.dynamics.reset_blocks(world_mask)
+        self.dynamics.restore(world_mask, self.model, state)
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

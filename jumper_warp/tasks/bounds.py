@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -42,7 +42,7 @@ EVENT_RANGES: dict[Function, dict[str, tuple[str, float]]] = {
 and the event's unit in the unit of the field."""
 
 
-def checked_number(where: str, key: str, value: Any, divides: bool = False) -> float:
+def checked_number(where: str, key: str, value: object, divides: bool = False) -> float:
     """Return a parameter of a term if it is within bounds; a duration is at most NEVER.
 
     Names decide on bounds: durations (DURATION) are 0 or more, widths of kernels (WIDTH, with `divides` DIVISOR)
@@ -62,7 +62,7 @@ def checked_number(where: str, key: str, value: Any, divides: bool = False) -> f
     return min(value, float(NEVER)) if DURATION.fullmatch(key) else value
 
 
-def check_event_ranges(func: Function, numbers: dict[str, Any]) -> None:
+def check_event_ranges(func: Function, numbers: Mapping[str, float]) -> None:
     """Raise InputError unless the ranges of one of the project's events are valid; numbers: its parameters by name."""
     for prefix, (field, unit) in EVENT_RANGES.get(func, {}).items():
         check_range(field, (numbers[f"{prefix}lower"], numbers[f"{prefix}upper"]), unit)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import operator
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import newton
 import numpy as np
 import warp as wp
 
@@ -46,7 +48,8 @@ TASK_BOUNDS = {
 }  # fmt: skip
 """Smallest and largest value of settings of a task, and unit."""
 LABEL = re.compile(r"[^/\[\]]+ \[[^\[\]]+\]")  # Name of a command's value, with its unit
-OF_EPISODE, OF_BASE = ("done", "termination", "level"), ("base_pos", "base_vel", "base_quat")
+OF_EPISODE = ("done", "termination", "level")
+OF_BASE = ("base_pos", "base_vel", "base_quat")
 """Names in `Env.task_arrays` that are no fields of the task's state, and that no field may have."""
 
 
@@ -109,7 +112,8 @@ class Command(Copyable):
 
         commands: (num_envs, n), or (n,) for all worlds; task: its name; worlds: (num_envs,) bool, to check bounds in.
         """
-        subject, num_envs = f"commands of {task} are {self}", len(worlds)
+        subject = f"commands of {task} are {self}"
+        num_envs = len(worlds)
         if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in self.counts]:
             raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
         steps = np.array([label.startswith("policy step") for label in self.labels] + 4 * [False])
@@ -235,7 +239,9 @@ class TaskCfg(Copyable):
 
     def _check_functions(self) -> None:
         """Raise InputError if a function of reset, command or curriculum does not fit the task."""
-        state, level, command = self.state, self.level_type, self.command
+        state = self.state
+        level = self.level_type
+        command = self.command
         reset = (RobotArrays, Scene, SkillSettings, state, self.settings_type, level, RngStream)
         robot = (RobotView, Scene, state)
         for where, func, takes, returns in (
@@ -262,7 +268,8 @@ class TaskCfg(Copyable):
 
         group: "actor" or "critic".
         """
-        columns, first = {}, 0
+        columns = {}
+        first = 0
         for term in getattr(self.observations, group):
             end = first + term.width * term.options["history"]
             columns[term.name], first = (first, end), end
@@ -284,16 +291,16 @@ class TaskCfg(Copyable):
         return tuple(column for term in self.observations.actor for column in term.columns)
 
     @property
-    def settings_type(self) -> Any:
+    def settings_type(self) -> Struct:
         """Warp struct type of the reset's settings; `NoSettings` if it has none."""
         return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
-    def level_type(self) -> Any:
+    def level_type(self) -> Struct:
         """Warp struct type of a curriculum level; `NoSettings` if there are no levels."""
         return self.levels[0].struct if self.levels else NoSettings
 
-    def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
+    def with_terms(self, section: str, **changes: dict[str, object]) -> TaskCfg:
         """Return a copy of the task with changed terms; changes: new numbers and options, by name of the term.
 
         section: "rewards", "terminations" or "events". Raises InputError: a term or number is unknown.
@@ -315,7 +322,7 @@ class TaskCfg(Copyable):
         return bool(getattr(self.reset.settings, "draws_ground", False))
 
     @property
-    def terrain(self) -> Any:
+    def terrain(self) -> newton.Heightfield | None:
         """Heightfield of the task for `Simulation(ground=...)`; None: a plane."""
         make = getattr(self.reset.settings, "heightfield", None)
         return None if make is None else make()
@@ -330,6 +337,16 @@ class TaskCfg(Copyable):
         if not hasattr(self.reset.settings, "on_level_ground"):
             return self
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))
+
+    def in_conditions(self, *, randomize: bool, noise: bool, ground_may_vary: bool) -> TaskCfg:
+        """Return the task as an environment with these options runs it.
+
+        Without randomize it is nominal and on level ground, without noise its observations are exact. Resets sample
+        ground only with ground_may_vary.
+        """
+        task = self if randomize and ground_may_vary else self.on_level_ground()
+        task = task if randomize else task.nominal()
+        return task if noise else task.without_noise()
 
     def nominal(self) -> TaskCfg:
         """Return a copy of the task with nominal robot parameters: without randomisation and events."""
@@ -350,6 +367,38 @@ class Handover(Copyable):
     def __post_init__(self) -> None:
         """Raise InputError if a field has a wrong type, or a function does not fit the states of the tasks."""
         check_types("handover:", self)
-        source, where = self.source.state, f"handover from {self.source.name} to {self.target.name},"
+        source = self.source.state
+        where = f"handover from {self.source.name} to {self.target.name},"
         check_result(f"{where} when", self.when, (RobotView, source, wp.bool), wp.bool)
         check_result(f"{where} begin", self.begin, (RobotView, source), self.target.state)
+
+
+def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
+    """Check the tasks and handovers (switches between tasks) of one environment, and return the tasks as a tuple.
+
+    task: a `TaskCfg` or several.
+    Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
+    torque, over-speed protection or gravity; or a handover is none, or refers to another task.
+    """
+    is_sequence = isinstance(task, Iterable) and not isinstance(task, str)
+    tasks: tuple[Any, ...] = tuple(task) if is_sequence else (task,)
+    for each in tasks:
+        if not isinstance(each, TaskCfg):
+            raise InputError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
+    names = [each.name for each in tasks]
+    if not tasks or len(set(names)) < len(names):
+        raise InputError(f"an environment needs at least one task, and unique names, got {names}")
+    first = tasks[0].motors
+    limits = (first.fade_start, first.fade_end, first.lateral.peak, first.transversal.peak)
+    for each in tasks[1:]:
+        motors = each.motors
+        if (motors.fade_start, motors.fade_end, motors.lateral.peak, motors.transversal.peak) != limits:
+            raise InputError(f"{each.name} and {names[0]} must have equal peak torque and over-speed protection")
+        if each.gravity != tasks[0].gravity:
+            raise InputError(f"gravity of {each.name} must be {tasks[0].gravity} m/s^2, got {each.gravity}")
+    for each in handovers if isinstance(handovers, Iterable) else (handovers,):
+        if not isinstance(each, Handover):
+            raise InputError(f"handovers must be a sequence of Handover, got {handovers!r:.60}")
+        if each.source not in tasks or each.target not in tasks:
+            raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
+    return tasks

@@ -10,14 +10,14 @@ import pickle
 import sys
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, TypeVar
 
 import warp as wp
+from warp._src.codegen import Struct  # the type of a `@wp.struct`
 
-from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.utils.sources import module_from_file
 
-Struct = type(NoSettings)
+T = TypeVar("T")
 
 
 class Copyable:
@@ -31,15 +31,15 @@ class Copyable:
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
         return {spec.name: getattr(self, spec.name) for spec in fields}
 
-    def __copy__(self) -> Any:
+    def __copy__(self) -> Self:
         return type(self)(**self.arguments())
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
         arguments = self.arguments().items()
         return type(self)(**{name: value if _is_named(value) else copy.deepcopy(value, memo)
                              for name, value in arguments})  # fmt: skip
 
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
         """Return the constructor call that `pickle` stores. Raises pickle.PicklingError: see `Reference.to`."""
         arguments = self.arguments().items()
         return _make, (type(self), {k: Reference.to(value) if _is_named(value) else value for k, value in arguments})
@@ -53,7 +53,7 @@ class Reference(NamedTuple):
     path: str | None  # file of the module, for one that cannot be imported
 
     @classmethod
-    def to(cls, definition: Any) -> Reference:
+    def to(cls, definition: object) -> Reference:
         """Return the reference to a function or struct. Raises PicklingError: not at the top level of its module."""
         module, module_name, name = top_level(definition)
         if module is None:
@@ -84,12 +84,12 @@ def top_level(definition: Any) -> tuple[ModuleType | None, str, str]:
     return module if found else None, python.__module__, python.__qualname__
 
 
-def _is_named(value: Any) -> bool:
+def _is_named(value: object) -> bool:
     """Return whether a value is a Warp function or struct."""
     return isinstance(value, wp.Function | Struct)
 
 
-def _make(kind: type, arguments: dict[str, Any]) -> Any:
+def _make(kind: type[T], arguments: dict[str, object]) -> T:
     """Return a new object of class `kind`; arguments: of its constructor, with references to functions and structs."""
     values = arguments.items()
     return kind(**{name: value.definition() if isinstance(value, Reference) else value for name, value in values})

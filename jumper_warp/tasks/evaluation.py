@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import warp as wp
 
+from jumper_warp.tasks.copying import Struct
 from jumper_warp.utils.errors import InputError
 
 
@@ -35,7 +36,7 @@ class Evaluation:
         """Return a copy of a `TaskCfg` with the terminations and the ground of the evaluation."""
         return task
 
-    def check(self, where: str, state: Any) -> None:
+    def check(self, where: str, state: Struct) -> None:
         """Raise InputError, with `where` before it, unless the evaluation fits the task's `state`, a `@wp.struct`."""
 
 
@@ -61,9 +62,9 @@ class EpisodeEvaluation(Evaluation):
 
     flags: ClassVar = "jumper_warp.evaluation.episodes:Episode"
 
-    def check(self, where: str, state: Any) -> None:
+    def check(self, where: str, state: Struct) -> None:
         """Raise InputError unless the state has the fields of all metrics and of the goal marker."""
-        wanted: dict[str, tuple[Any, ...]] = {
+        wanted: dict[str, tuple[type, ...]] = {
             metric.field: (float, int, wp.float32, wp.int32) for metric in self.metrics
         }
         wanted |= {self.goal_marker: (float, wp.float32, wp.vec3)} if self.goal_marker else {}

@@ -28,7 +28,7 @@ def source_of(definition: Any) -> Any:
     return definition.cls if isinstance(definition, Struct) else type(definition)
 
 
-def place_of(definition: Any) -> str:
+def place_of(definition: object) -> str:
     """Return file and line where a Warp function, a struct or an object's class is defined, as `my_task.py:12`."""
     source = source_of(definition)
     try:
@@ -37,7 +37,7 @@ def place_of(definition: Any) -> str:
         return source.__module__
 
 
-def is_own(definition: Any) -> bool:
+def is_own(definition: object) -> bool:
     """Return whether a user defined a Warp function, a struct or an object's class, outside this project."""
     return not source_of(definition).__module__.startswith(PROJECT_PREFIX)
 
@@ -53,14 +53,15 @@ def shown_type(kind: Any) -> str:
 
 
 def check_function(
-    where: str, func: Any, takes: Sequence[Any], returns: str, may_return: Callable[[Any], bool]
+    where: str, func: Any, takes: Sequence[object], returns: str, may_return: Callable[[object], bool]
 ) -> None:
     """Raise InputError, with file and line, unless a Warp function has argument types `takes` and a valid return type.
 
     Body and return type are checked only of functions from outside the project. where: part of the task, for messages.
     returns: type of the result in words; may_return: whether a type is valid.
     """
-    name, actual = func.key.rsplit(".", 1)[-1], list(func.input_types.values())
+    name = func.key.rsplit(".", 1)[-1]
+    actual = list(func.input_types.values())
     if len(actual) != len(takes):
         wanted = f"must have {len(takes)} arguments ({', '.join(map(shown_type, takes))})"
         raise InputError(f"{place_of(func)}: {where}: the function {wanted}, it has {len(actual)}")
@@ -82,9 +83,10 @@ def check_function(
             raise InputError(f"{place_of(each)}: {where}: {name} ends without `return` in some cases, add one")
 
 
-def _with_called(func: Any) -> set[Any]:
+def _with_called(func: wp.Function) -> set[wp.Function]:
     """Return a Warp function and all functions from outside the project that it calls, directly or not."""
-    found, rest = set(), [func]
+    found = set()
+    rest = [func]
     while rest:
         each = rest.pop()
         if each not in found and not each.is_builtin() and is_own(each):
@@ -107,7 +109,7 @@ def _may_end_without_result(func: Any) -> bool:
     return has_value and not returns(tree.body[0].body)
 
 
-def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
+def check_result(where: str, func: Any, takes: Sequence[object], returns: object) -> None:
     """Raise InputError, with file and line, unless a function has argument types `takes` and return type `returns`."""
     where = f"{where} {func.key.rsplit('.', 1)[-1]}"
     check_function(where, func, takes, shown_type(returns), lambda kind: SAME.get(kind, kind) is returns)
@@ -129,12 +131,13 @@ def _returned(func: wp.Function, takes: tuple[Any, ...], content: bytes) -> Any:
     return overload.value_func(None, None)
 
 
-def check_values(where: str, settings: Any, *args: float) -> None:
+def check_values(where: str, settings: object, *args: float) -> None:
     """Raise InputError unless `settings.struct` is a Warp struct, and `settings.values(*args)` returns an instance.
 
     The instance is checked only of settings from outside the project.
     """
-    struct, values = getattr(settings, "struct", None), getattr(settings, "values", None)
+    struct = getattr(settings, "struct", None)
+    values = getattr(settings, "values", None)
     if not isinstance(struct, Struct) or not callable(values):
         raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")
     if is_own(settings):

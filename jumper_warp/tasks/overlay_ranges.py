@@ -49,7 +49,9 @@ def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
     """Return the offsets by which an overlay shifts randomisation ranges; 0 where it has no value, or its own range."""
     if overlay is None:
         return RangeMoves()
-    described, own, moves = vars(RobotValues.nominal(1)), overlay.randomization, {}
+    described = vars(RobotValues.nominal(1))
+    own = overlay.randomization
+    moves = {}
     for name, quantity in MOVED.items():
         if quantity in overlay.values and name not in own:
             pairs = zip(overlay.values[quantity], described[quantity][0], strict=True)
@@ -75,7 +77,8 @@ def with_own_ranges(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
             f"robot overlay: latency of {move:g} ms and the range {list(latency)} ms around it exceed "
             f"{LONGEST_LATENCY:g} ms: give the overlay a range"
         )
-    least, mass = (ranges.base_mass or (0.0, 0.0))[0], float(overlay.robots().base_mass[0, 0])
+    least = (ranges.base_mass or (0.0, 0.0))[0]
+    mass = float(overlay.robots().base_mass[0, 0])
     if least <= -mass:
         raise InputError(f"randomisation range base_mass must be above {-mass:g} kg for this robot, got {least:g}")
     return replace(task, randomization=ranges)
@@ -87,7 +90,8 @@ def ranges_of(task: TaskCfg, overlay: RobotOverlay | None) -> dict[str, Any]:
     Ranges that are off are left out.
     Motors with different friction have a list of 12 ranges. Errors: as `with_own_ranges`.
     """
-    ranges, moves = with_own_ranges(task, overlay).randomization, moves_of(overlay)._asdict()
+    ranges = with_own_ranges(task, overlay).randomization
+    moves = moves_of(overlay)._asdict()
     result: dict[str, Any] = {}
     for name in RANDOMIZED:
         if (pair := getattr(ranges, name)) is not None:
@@ -103,7 +107,8 @@ def range_words(task: TaskCfg, overlay: RobotOverlay | None, *, changed: bool = 
     Where motors differ, a text is over all of them.
     changed: only ranges that the overlay moves or replaces.
     """
-    words, usual = [], ranges_of(task, None)
+    words = []
+    usual = ranges_of(task, None)
     for name, value in ranges_of(task, overlay).items():
         if not changed or value != usual.get(name):
             ends = np.ravel(value)

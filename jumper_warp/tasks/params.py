@@ -31,9 +31,12 @@ class TermSlot(SimpleNamespace):
         numbers = list(term.flat_numbers)
         settings = numbers[: len(numbers) - term.num_params]
         super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
-        self.term, self.func = term, term.func
+        self.term = term
+        self.func = term.func
         self.parameterless = not term.num_params  # Warp refuses an empty `*p[start:start]`
-        self.first, self.start, self.stop = offset, offset + len(settings), offset + len(numbers)
+        self.first = offset
+        self.start = offset + len(settings)
+        self.stop = offset + len(numbers)
         """Half-open range of the function's parameters: `*p[slot.start : slot.stop]`."""
         self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
         """Parts of the term that are compiled into a kernel; tasks with equal tuples share the kernel."""
@@ -78,7 +81,7 @@ class TaskParams:
 class ParamArrays:
     """Device array of the parameters of all terms of a task; values can change while captured CUDA graphs read them."""
 
-    def __init__(self, params: TaskParams, device: Any) -> None:
+    def __init__(self, params: TaskParams, device: wp.DeviceLike) -> None:
         """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""
         self.params = params
         self._numbers = list(params.values)  # `values` before their conversion to float32

@@ -9,7 +9,8 @@ from typing import Any, Literal
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.bounds import check_range
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_probabilities
+from jumper_warp.utils.checks import check_probabilities, check_types
+from jumper_warp.utils.kernels import Function
 
 Range = tuple[float, float] | None  # (lower, upper), or None: off
 NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not randomised
@@ -73,7 +74,8 @@ class RandomizationCfg:
     """When parameters other than pushes are sampled: once at startup, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a range is reversed, not finite or out of bounds, or a probability is not in 0 to 1."""
+        """Raise InputError for a field of another type, a reversed range, or one out of bounds."""
+        check_types("randomisation", self)
         for name, value in vars(self).items():
             if isinstance(value, tuple):
                 check_range(name, value)
@@ -123,7 +125,7 @@ class RandomizationCfg:
         """Return the events that sample robot parameters from the ranges that are not None; numbers are in SI units."""
         terms = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
+        def add(func: Function, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
                 terms.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **numbers))

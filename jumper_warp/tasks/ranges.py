@@ -10,6 +10,7 @@ import warp as wp
 
 from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 
 Pair = tuple[float, float]  # (lower, upper) end of a range
 
@@ -32,7 +33,9 @@ def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative
             raise InputError(f"{prefix} {name} must not be negative, got {least}")
 
 
-def filled(struct: Any, cfg: Any, skip: Collection[str] = (), degrees: Collection[str] = ()) -> Any:
+def filled(
+    struct: KernelStruct, cfg: object, skip: Collection[str] = (), degrees: Collection[str] = ()
+) -> KernelStruct:
     """Copy the fields of a settings dataclass to a kernel struct, pairs (lower, upper) as vec2; return the struct.
 
     skip: fields to omit; degrees: fields [deg] to convert to [rad].

@@ -90,7 +90,8 @@ def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[
             raise InputError(f"switching needs a task with {state.key}, got {task.name}")
     randomization = replace((jumps[-1] if jumps else walking).randomization, resample_at="reset")
     walk = for_switching(walking, randomization)
-    tasks, switches = [walk], []
+    tasks = [walk]
+    switches = []
     for jump in jumps:
         tasks.append(for_switching(jump, randomization))
         switches.append(Handover(walk, tasks[-1], handovers.walk_to_jump_due, handovers.begin_jump))

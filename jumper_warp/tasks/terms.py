@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_type_hints
+from typing import Any, ClassVar, Self, get_type_hints
 
 import warp as wp
 
@@ -22,7 +22,7 @@ from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.tasks.bounds import check_event_ranges, checked_number
-from jumper_warp.tasks.copying import Copyable
+from jumper_warp.tasks.copying import Copyable, Struct
 from jumper_warp.tasks.functions import check_function, is_own, place_of, shown_type
 from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.errors import InputError
@@ -45,7 +45,7 @@ class Term(Copyable):
     takes: ClassVar[tuple[tuple[Any, ...], ...]] = ((RobotView, Any),)
     """Allowed types of the leading arguments, which the kernel passes; Any: the task's state. The first argument
     decides. All other arguments are the term's numbers."""
-    returns: ClassVar[tuple[Any, ...]] = ()
+    returns: ClassVar[tuple[type, ...]] = ()
     """Allowed return types; empty: any."""
     settings: ClassVar[dict[str, Any]] = {}
     """Defaults of the numbers that the kernel itself reads; they come before the function's numbers."""
@@ -62,7 +62,8 @@ class Term(Copyable):
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
             raise InputError(f"{kind}: {func!r:.60} is not a @wp.func")
-        self.func, self.name = func, name or func.key.split(".")[-1]
+        self.func = func
+        self.name = name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
         self._check_types(f"{place_of(func)}: {where}")
         python: Any = func.func
@@ -106,12 +107,12 @@ class Term(Copyable):
             annotated = shown_type(returned)
             raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
 
-    def _leading(self) -> tuple[Any, ...]:
+    def _leading(self) -> tuple[object, ...]:
         """Return the types of the leading arguments, from `takes`, that fit the term's function; empty: none do."""
         first = next(iter(self.func.input_types.values()), None)
         return next((kinds for kinds in self.takes if first in (Any, kinds[0])), ())
 
-    def _may_return(self, kind: Any, state: Any = Any) -> bool:
+    def _may_return(self, kind: object, state: object = Any) -> bool:
         """Return whether the term's function may return values of type `kind` in a task with this `state`."""
         return not self.returns or kind in self.returns
 
@@ -120,13 +121,13 @@ class Term(Copyable):
         """Description, for messages, of the type that the term's function must return."""
         return self.returns[0].__name__ if self.returns else "any type"
 
-    def check(self, state: Any) -> None:
+    def check(self, state: Struct) -> None:
         """Raise InputError unless the term's function fits the task's `state`, a `@wp.struct`, and can be compiled."""
         takes = [state if kind is Any else kind for kind in self._leading()] + [wp.float32] * self.num_params
         where = f"{type(self).__name__} {self.name}"
         check_function(where, self.func, takes, self.returned, lambda kind: self._may_return(kind, state))
 
-    def replace(self, **changes: Any) -> Any:
+    def replace(self, **changes: Any) -> Self:
         """Return a copy of the term with changed function, name, numbers or options.
 
         Raises InputError like the constructor.
@@ -145,7 +146,7 @@ class Term(Copyable):
             flat |= {f"{key}.lower": value[0], f"{key}.upper": value[1]} if pair else {key: value}
         return flat
 
-    def with_flat_numbers(self, flat: Iterable[float]) -> Any:
+    def with_flat_numbers(self, flat: Iterable[float]) -> Self:
         """Return a copy of the term with new numbers, in the order of `flat_numbers`; errors: as `replace`."""
         rest = iter(flat)
         parts = {key: tuple(next(rest) for _ in value) if isinstance(value, tuple) else next(rest)
@@ -230,7 +231,7 @@ class ObservationTerm(Term):
             wanted = f"1 to {self.width}, each once with a sign, and be its own inverse"
             raise InputError(f"ObservationTerm {self.name}: mirror must have {wanted}, got {self.mirror}")
 
-    def _may_return(self, kind: Any, state: Any = Any) -> bool:
+    def _may_return(self, kind: object, state: object = Any) -> bool:
         """Return whether the term's function may return values of type `kind`: a number or a vector."""
         vector = hasattr(kind, "_length_") and getattr(kind, "_wp_scalar_type_", None) is wp.float32
         return kind in (float, wp.float32) or vector
@@ -280,7 +281,8 @@ class EventTerm(Term):
 
     def __init__(self, func: Function, **values: Any) -> None:
         super().__init__(func, **values)
-        mode, interval = self.options["mode"], self.numbers["interval_range_s"]
+        mode = self.options["mode"]
+        interval = self.numbers["interval_range_s"]
         if mode not in ("startup", "reset", "interval"):
             raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
         if mode == "interval" and self.options["parallel"]:
@@ -302,7 +304,7 @@ class Advance(Term):
     Function: (robot: RobotView, state, ...) -> state.
     """
 
-    def _may_return(self, kind: Any, state: Any = Any) -> bool:
+    def _may_return(self, kind: object, state: object = Any) -> bool:
         """Return whether the function may return type `kind`: the state or, if that is unknown, a `@wp.struct`."""
         return kind in (Any, state) or (state is Any and hasattr(kind, "vars"))
 

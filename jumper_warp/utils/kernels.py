@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,14 @@ if TYPE_CHECKING:  # Warp annotates its decorators as if they returned the decor
     Kernel = wp.Kernel | Callable[..., None]
 else:
     Function, Kernel = wp.Function, wp.Kernel
+
+
+class KernelStruct(Protocol):
+    """Instance of a `@wp.struct` of the kernels, whose fields only Warp can check."""
+
+    def __getattr__(self, name: str, /) -> Any: ...
+
+    def __setattr__(self, name: str, value: Any, /) -> None: ...
 
 
 def records(structs: wp.array) -> NDArray[np.void]:

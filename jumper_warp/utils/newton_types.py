@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         joint_armature: wp.array
         joint_child: wp.array
         joint_damping: wp.array
+        joint_f: wp.array
         joint_friction: wp.array
         joint_mimic_joint: wp.array
         joint_parent: wp.array

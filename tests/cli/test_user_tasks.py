@@ -160,7 +160,7 @@ def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path)
 
 def test_recipe_uses_the_users_reward_function(runs, path):
     config = open_policy(runs["tame-jump"]).config
-    with pytest.raises(TaskError, match=r"task.rewards\[0\] needs 'my_jumps:base_at_rest'"):
+    with pytest.raises(TaskError, match=r"task.rewards\[0\].func needs 'my_jumps:base_at_rest'"):
         Recipe.from_json(config, [])
     module = load_task_module(path)
     task = Recipe.from_json(config, [module]).task

@@ -31,7 +31,7 @@ def ground_task(**shares) -> TaskCfg:
 
 def blocks_of(env: Env) -> np.ndarray:
     """Return the blocks on the ground of all worlds, a structured array."""
-    return env.sim.physics.dynamics.robot.ground.blocks.numpy()
+    return env.sim.dynamics.robot.ground.blocks.numpy()
 
 
 # ---------------------------------------------------------------- sampling
@@ -101,7 +101,7 @@ def test_an_evaluation_starts_robots_on_the_block_below_them():
     for _ in range(20):
         env.step(REST)
         assert not env.done.any() and not env.robot.diverged.numpy().any()
-    env.sim.physics.write_bodies()
+    env.sim.write_bodies()
     np.testing.assert_allclose(paw_centres(env.sim)[..., Z], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 
 
@@ -155,7 +155,7 @@ def test_the_next_jump_of_an_episode_has_the_ground_height_at_its_goal(landed):
 def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(landed):
     moved = blocks_of(landed)
     moved["center"][:, X] += 20.0
-    landed.sim.physics.dynamics.robot.ground.blocks.assign(moved)
+    landed.sim.dynamics.robot.ground.blocks.assign(moved)
     landed.command(np.tile([0.75, 0.3, 0.0], (N, 1)))
     assert not landed.task_arrays()["goal_ground"].any()
 

@@ -155,7 +155,7 @@ def drawn_of(env) -> dict[str, np.ndarray]:
     parameters, motors = env.parameters, env.parameters.motors
     found = {name: getattr(parameters, name).numpy().copy() for name in ("latency", "static_ratio")}
     found |= {name: getattr(motors, name).numpy().copy() for name in ("kp", "kd", "no_load_speed", "offset")}
-    table = env.sim.physics.dynamics.robot.table
+    table = env.sim.dynamics.robot.table
     return found | {"table": table.numpy().copy(), "push": parameters.push.numpy().T.copy()}
 
 

@@ -21,7 +21,7 @@ HORIZONTAL = dataclasses.replace(make_task("horizontal-jump"), gravity=MARS)
 def test_a_thrown_robot_follows_the_parabola_of_its_gravity(solver):
     sim = Simulation(1, solver=solver, ground=None, gravity=MARS, visuals=False, device="cpu")
     sim.state.joint_qd.assign(np.eye(38)[2].astype(np.float32) * UP)
-    sim.physics.write_bodies()
+    sim.write_bodies()
     mass = sim.model.body_mass.numpy()
 
     def com() -> float:  # height [m] of the robot's centre of mass
@@ -37,7 +37,7 @@ def test_starts_in_flight_reach_their_apex_in_each_worlds_own_gravity():
     env = make_env(6, task=VERTICAL, reset=only("in_flight", base_xy=0.0, flight_time=(0.01, 0.3)))
     own = np.array([1.62, 3.71, 3.71, 8.87, 9.81, 24.8])
     env.sim.model.gravity.assign(np.pad(np.outer(own, [0.0, 0.0, -1.0]), ((0, 1), (0, 0))).astype(np.float32))
-    env.sim.physics.parameters_changed()
+    env.sim.dynamics.parameters_changed()
     env.reset()
     q, qd, goals = env.sim.joint_q(), env.sim.joint_qd(), episodes_of(env)["goal"][:, Z]
     np.testing.assert_allclose(q[:, Z] + qd[:, Z] ** 2 / (2.0 * own), goals, atol=1e-4)

@@ -61,7 +61,7 @@ def test_each_world_shows_its_own_block_also_after_a_change():
     envs.reset(seed=1)
     large, small = (brown(image) for image in envs.render())
     assert large > 2 * small > 100
-    blocks = envs.env.sim.physics.dynamics.robot.ground.blocks
+    blocks = envs.env.sim.dynamics.robot.ground.blocks
     values = blocks.numpy()
     values["exists"][0], values["half"][1] = 0, values["half"][0]
     blocks.assign(values)

@@ -11,8 +11,8 @@ from jump_helpers import random_actions
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.model import build_model
+from jumper_warp.sim.dynamics import MIN_WORLDS
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import MIN_WORLDS
 from jumper_warp.sim.solver import SolverJumper
 
 N = 2 * MIN_WORLDS

@@ -131,7 +131,7 @@ def test_a_push_increases_momentum_by_force_times_time():
     env.sim.state.joint_q.assign(q.ravel())
     env.robot.contact_time.fill_(1.0)
     env.step(torch.zeros((2, 12)))
-    env.sim.physics.write_bodies()
+    env.sim.write_bodies()
     velocity = env.sim.state.body_qd.numpy().reshape(2, 21, 6)[..., :3].astype(float)
     momentum = (env.sim.model.body_mass.numpy().reshape(2, 21, 1) * velocity).sum(axis=1)
     np.testing.assert_allclose(momentum[1] - momentum[0], np.array([4.0, -3.0, 5.0]) / 60.0, atol=2e-3)

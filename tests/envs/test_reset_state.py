@@ -72,5 +72,5 @@ def test_motors_hold_the_present_angles_until_the_first_action_arrives():
     held = env.delays.target_history.numpy() - env.sim.motors.offset.numpy()
     angles = env.sim.joint_q()[:, [7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]]
     np.testing.assert_allclose(held, np.broadcast_to(angles.T, held.shape), atol=1e-6)
-    env.sim.physics.advance(1, env.delays.current_target)
+    env.sim.advance(1, env.delays.current_target)
     assert np.abs(env.robot.torque.numpy()).max() < 1e-3

@@ -56,7 +56,7 @@ def parameters_of(env) -> dict[str, np.ndarray]:
     found = {name: getattr(motors, name).numpy().copy() for name in names}
     found |= {name: getattr(parameters, name).numpy().copy() for name in ("latency", "observation_latency")}
     found |= {"push": parameters.push.numpy().T.copy()}
-    return found | {"table": env.sim.physics.dynamics.robot.table.numpy().copy()}
+    return found | {"table": env.sim.dynamics.robot.table.numpy().copy()}
 
 
 def coordinates(env) -> np.ndarray:

@@ -20,8 +20,8 @@ from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.sim.dynamics import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool

@@ -111,7 +111,7 @@ def test_leaving_the_map_ends_the_episode_as_a_time_out(rough):
 
 def test_nominal_environment_is_on_a_plane():
     env = walking_env(4, task=on_small_map())
-    assert env.sim.physics.dynamics.robot.ground.rows == 0
+    assert env.sim.dynamics.robot.ground.rows == 0
     assert np.abs(env.sim.joint_q()[:, XY]).max() <= 0.1 and not states_of(env)["limit"].any()
 
 

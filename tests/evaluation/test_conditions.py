@@ -116,7 +116,7 @@ def test_conditions_change_only_the_fixed_parameters():
     np.testing.assert_allclose(motors.kp.numpy(), 0.6 * others.kp.numpy(), rtol=1e-6)
     for name in ("kd", "no_load_speed", "cutoff_speed", "saturation", "offset"):
         np.testing.assert_array_equal(getattr(motors, name).numpy(), getattr(others, name).numpy())
-    table, before = (each.sim.physics.dynamics.robot.table.numpy() for each in (env, nominal))
+    table, before = (each.sim.dynamics.robot.table.numpy() for each in (env, nominal))
     changed = (table != before).any(axis=1)
     assert changed.sum() == 8 and (table[changed] == np.float32(0.4)).all()  # static, dynamic friction of four legs
     assert not env.parameters.push.numpy().any()
@@ -141,7 +141,7 @@ def test_fixing_a_parameter_at_its_nominal_value_is_bitwise_neutral():
         for step in range(20):
             env.step(torch.full((2, 12), 0.02 * step))
     assert torch.equal(pair[0].obs, pair[1].obs)
-    np.testing.assert_array_equal(*(env.sim.physics.dynamics.robot.table.numpy() for env in pair))
+    np.testing.assert_array_equal(*(env.sim.dynamics.robot.table.numpy() for env in pair))
     np.testing.assert_array_equal(*(env.sim.joint_q() for env in pair))
 
 

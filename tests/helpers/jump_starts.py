@@ -91,7 +91,7 @@ def paws_and_velocities(env: Env, worlds: np.ndarray) -> np.ndarray:
 def collision_flags(env: Env) -> np.ndarray:
     """Return the collision flags of every world, (num_envs,)."""
     flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
-    robot = env.sim.physics.dynamics.robot
+    robot = env.sim.dynamics.robot
     inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
     wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
     return flags.numpy()

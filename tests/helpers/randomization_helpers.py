@@ -49,7 +49,7 @@ def randomized(cfg, num_envs=N, **arguments):
 
 def read(env):
     """Return every randomised parameter from solver, motors and environment by name, (..., num_envs)."""
-    n, table = env.num_envs, env.sim.physics.dynamics.robot.table.numpy().astype(float)
+    n, table = env.num_envs, env.sim.dynamics.robot.table.numpy().astype(float)
     legs = np.array([leg * layout.LEG_ROWS for leg in range(4)])
     links = np.array([[leg + link * layout.MOMENT_ROWS for link in range(5)] for leg in legs]).ravel()
     base, motors, parameters = int(layout.BASE), env.sim.motors, env.parameters

@@ -101,7 +101,7 @@ class Flight:
             wp.array(joint_f.ravel(), dtype=self.dtype, device="cpu"),
             wp.array(wrench.reshape(-1, 6), dtype=wp.spatial_vector, device="cpu"),
         )
-        d.advance(d.settings(dt, steps, 50, 1.0e-5), drive, q, qd, q, qd)
+        d.advance(dt, steps, drive, q, qd, q, qd)
         return States.read(q.numpy(), qd.numpy())
 
 

@@ -89,7 +89,7 @@ def test_missing_setting_gets_its_default(saved):
 def test_refuses_an_unknown_reward_unless_rewards_are_left_out(saved):
     _, config = saved
     config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
-    with pytest.raises(TaskError, match=r"task.rewards\[23\] needs 'mine:my_own': pass the file"):
+    with pytest.raises(TaskError, match=r"task.rewards\[23\].func needs 'mine:my_own': pass the file"):
         whole(config)
     assert nominal(config).name == "vertical-jump"
 

@@ -71,7 +71,7 @@ def test_simulation_uses_overlay_values(solver):
     np.testing.assert_allclose(sim.motors.offset.numpy()[:, 0], VALUES["offset"], rtol=1e-6)
     assert sim.model.joint_armature.numpy().reshape(2, int(DOFS))[1, 6] == pytest.approx(0.005)  # FL lateral
     if solver == "jumper":
-        table = sim.physics.dynamics.robot.table.numpy()
+        table = sim.dynamics.robot.table.numpy()
         assert table[:, 0] == pytest.approx(table[:, 1])
         assert np.isclose(table, 0.7).sum() >= 16  # both coefficients of four paws in two worlds
 

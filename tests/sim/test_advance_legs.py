@@ -55,8 +55,8 @@ def advance(dynamics, q, qd, force, by_legs, substeps=4, tolerance=1.0e-12):
     wrench = np.zeros((N * 21, 6), dtype=np.float32)
     wrench[::21] = np.random.default_rng(5).normal(size=(N, 6))
     drive = dynamics.drive(force, wp.array(wrench, dtype=wp.spatial_vector))
-    settings = dynamics.settings(1.0 / 480.0, substeps, 500, tolerance)
-    dynamics.advance(settings, drive, q, qd, q, qd, by_legs=by_legs)
+    dynamics.max_sweeps, dynamics.tolerance = 500, tolerance
+    dynamics.advance(1.0 / 480.0, substeps, drive, q, qd, q, qd, by_legs=by_legs)
     work = dynamics.work
     arrays = (work.impulse, work.contact_force, work.peak_force, work.peak_paw_force, work.torque)
     return q.numpy(), qd.numpy(), *(array.numpy() for array in arrays)

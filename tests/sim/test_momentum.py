@@ -55,7 +55,7 @@ def test_momentum_changes_by_gravity_alone_in_flight(flights):
 def test_bodies_match_projected_coordinates(flights):
     sim = flights[True][0]
     written = sim.state.body_qd.numpy().copy()
-    sim.physics.write_bodies()
+    sim.write_bodies()
     np.testing.assert_array_equal(sim.state.body_qd.numpy(), written)
 
 

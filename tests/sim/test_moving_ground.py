@@ -11,9 +11,9 @@ from jumper_warp.kernels.terrain.ground import Ground, block_normal, ground_dist
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, build_model
-from jumper_warp.sim.dynamics import JumperDynamics
+from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.sim.solver import TOLERANCE, SolverJumper
+from jumper_warp.sim.solver import SolverJumper
 from simulation_helpers import (
     PAW_RADIUS,
     WEIGHT,
@@ -315,7 +315,8 @@ def test_block_in_single_precision_matches_double_precision():
     qd = sim.joint_qd().copy()
     qd[:, X] = 1.0
     write_state(sim, qd=qd)
-    double = JumperDynamics(sim.model, block=BlockCfg(**WIDE, mass=np.array([5.0, 20.0]), friction=0.1), double=True)
+    block = BlockCfg(**WIDE, mass=np.array([5.0, 20.0]), friction=0.1)
+    double = JumperDynamics(sim.model, block=block, tolerance=1.0e-9, double=True)
     q, qd = (wp.array(v.ravel(), dtype=wp.float64, device="cpu") for v in (sim.joint_q(), sim.joint_qd()))
     for _ in range(SUBSTEPS * 4):  # four policy steps
         sim.physics_step()
@@ -325,7 +326,7 @@ def test_block_in_single_precision_matches_double_precision():
             wp.array(joint_f.ravel(), dtype=wp.float64, device="cpu"),
             wp.zeros(42, dtype=wp.spatial_vector, device="cpu"),
         )
-        double.advance(double.settings(PHYSICS_DT, 1, 50, 1.0e-9), drive, q, qd, q, qd)
+        double.advance(PHYSICS_DT, 1, drive, q, qd, q, qd)
     blocks = double.robot.ground.blocks.numpy()
     assert blocks["center"].dtype == np.float64
     assert blocks["center"][:, X].min() > 1e-3
@@ -346,7 +347,7 @@ def test_new_episode_resets_the_block_and_a_loaded_state_restores_it(begin):
     block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
     env = Env(make_task("horizontal-jump"), 2, device="cpu", block=block)
     start = env.sim.solver.block_position()
-    blocks = env.sim.physics.dynamics.robot.ground.blocks
+    blocks = env.sim.dynamics.robot.ground.blocks
     moved = blocks.numpy().copy()
     moved["center"] += 0.2
     moved["velocity"] = 0.5

@@ -43,7 +43,7 @@ def snapshot(sim):
     n = sim.num_worlds
     state = [getattr(sim.state, name).numpy().reshape(n, -1) for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
     results = [np.moveaxis(getattr(sim, name).numpy(), 0 if name == "peak_force" else 1, 0) for name in RESULTS]
-    results += [sim.target.numpy().T, sim.physics.peak_paw_force.numpy().T]
+    results += [sim.target.numpy().T, sim.peak_paw_force.numpy().T]
     return [values.reshape(n, -1).copy() for values in [*state, *results]]
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from columns import DOFS, MOTOR_COORDS, MOTOR_DOFS, QUAT, XY, X, Y, Z
-from jumper_warp.sim.solver import TOLERANCE
+from jumper_warp.sim.dynamics import TOLERANCE
 from simulation_helpers import (
     WEIGHT,
     command,

@@ -120,7 +120,7 @@ class StopSteps:
     def __init__(self, num_worlds, *, stops):
         """stops: whether the stops have stiffness and damping."""
         self.n, self.model = num_worlds, build_model(num_worlds, visuals=False, device="cpu")
-        self.dynamics = JumperDynamics(self.model, double=True)
+        self.dynamics = JumperDynamics(self.model, max_sweeps=5000, tolerance=1.0e-9, double=True)
         if not stops:
             table = self.dynamics.robot.table.numpy()
             for leg in range(4):
@@ -143,7 +143,7 @@ class StopSteps:
         q, qd, force = (wp.array(v, dtype=wp.float64) for v in (states.joint_q(), states.joint_qd(), joint_f.ravel()))
         self.dynamics.work.impulse.zero_()
         drive = self.dynamics.drive(force, wp.zeros(self.n * BODIES, dtype=wp.spatial_vector))
-        self.dynamics.advance(self.dynamics.settings(DT, 1, 5000, 1.0e-9), drive, q, qd, q, qd)
+        self.dynamics.advance(DT, 1, drive, q, qd, q, qd)
         new = States.read(q.numpy(), qd.numpy())
         com = self.model.body_com.numpy()[::BODIES].astype(float)
         before, after = Rotation.from_quat(states.quat), Rotation.from_quat(new.quat)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
@@ -13,6 +13,7 @@ from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class TurnCfg:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
         check_probabilities("turn", self, "body_axis_probability")
 
-    def values(self) -> Any:
+    def values(self) -> KernelStruct:
         """Return the range of commanded turns as a kernel struct, `TurnRanges`, with angles in radians."""
         return filled(TurnRanges(), self, degrees=("angle",))
 
@@ -78,7 +79,7 @@ class AttitudeResetCfg:
         """Largest time limit of an episode [s], the upper end of `episode`."""
         return self.episode[1]
 
-    def values(self, step_dt: float) -> Any:
+    def values(self, step_dt: float) -> KernelStruct:
         """Return the ranges of start states as a kernel struct, `AttitudeSettings`.
 
         Angles are in radians, times in policy steps of step_dt [s].

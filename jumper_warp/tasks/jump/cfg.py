@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, Literal
+from typing import Literal
 
 import warp as wp
 
@@ -18,6 +18,7 @@ from jumper_warp.tasks.cfg import Command
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_positive, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 
 JUMP_COMMAND = Command(
     set_jump, next_jump_due, resample_jump, optional=1,
@@ -67,7 +68,7 @@ class GroundCfg:
         """Whether resets sample platforms or blocks as the ground of robots."""
         return self.platform + self.block > 0.0
 
-    def ranges(self) -> Any:
+    def ranges(self) -> KernelStruct:
         """Return the settings of sampled platforms and blocks as a kernel struct, `GroundRanges`."""
         return filled(GroundRanges(), self)
 
@@ -95,11 +96,12 @@ class Level:
         check_positive("base_height of a level", *self.base_height)
         check_probabilities("level", self, "next_jump_probability")
 
-    def values(self) -> Any:
+    def values(self) -> KernelStruct:
         """Return the curriculum level as a kernel struct, `JumpLevel`."""
         level = JumpLevel()
         level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
-        level.base_height, level.next_jump_probability = wp.vec2(*self.base_height), self.next_jump_probability
+        level.base_height = wp.vec2(*self.base_height)
+        level.next_jump_probability = self.next_jump_probability
         level.elliptical = int(self.elliptical)
         return level
 
@@ -216,13 +218,14 @@ class ResetCfg:
     struct = JumpSettings
     """Type of the kernel struct that `values` returns."""
 
-    def values(self, step_dt: float) -> Any:
+    def values(self, step_dt: float) -> KernelStruct:
         """Return the ranges of start states and grounds as a kernel struct, `JumpSettings`.
 
         Angles are in radians, delays in policy steps of step_dt [s].
         """
         settings = JumpSettings()
-        settings.states, settings.grounds = self._ranges(step_dt), self.ground.ranges()
+        settings.states = self._ranges(step_dt)
+        settings.grounds = self.ground.ranges()
         return settings
 
     @property
@@ -234,7 +237,7 @@ class ResetCfg:
         """Return a copy of the configuration without sampled platforms and blocks."""
         return replace(self, ground=GroundCfg())
 
-    def _ranges(self, step_dt: float) -> Any:
+    def _ranges(self, step_dt: float) -> KernelStruct:
         """Return the ranges of start states as a kernel struct, `ResetRanges`; step_dt: policy step [s]."""
         degrees = (
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",

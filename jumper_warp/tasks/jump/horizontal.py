@@ -149,7 +149,8 @@ def horizontal_jump_slippery() -> TaskCfg:
 
 def horizontal_jump_sighted() -> TaskCfg:
     """Return the task of a horizontal jump in which the policy observes edges and height of the block ahead."""
-    task, ground = horizontal_jump(), replace(RESET.ground, platform=0.30, block=0.45)
+    task = horizontal_jump()
+    ground = replace(RESET.ground, platform=0.30, block=0.45)
     return replace(
         task,
         name="horizontal-jump-sighted",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
@@ -16,6 +16,7 @@ from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import MOST_SETTING, check_bounds, check_probabilities, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import KernelStruct
 
 if TYPE_CHECKING:
     import newton
@@ -87,7 +88,7 @@ class CommandCfg:
             raise InputError(f"resampling_time_range must be (lower, upper), positive, got ({low}, {high})")
         object.__setattr__(self, "resampling_time_range", (min(low, float(NEVER)), min(high, float(NEVER))))
 
-    def values(self) -> Any:
+    def values(self) -> KernelStruct:
         """Return the ranges of commands as a kernel struct, `CommandRanges`, with times in policy steps of 1/60 s."""
         ranges = filled(CommandRanges(), self, skip=("first_range", "last_range", "levels", "resampling_time_range"))
         ranges.first_range, ranges.last_range = wp.vec4(*self.first_range), wp.vec4(*self.last_range)
@@ -148,13 +149,14 @@ class VelocityResetCfg:
         """Time limit of an episode [s]."""
         return self.episode
 
-    def values(self, step_dt: float) -> Any:
+    def values(self, step_dt: float) -> KernelStruct:
         """Return the ranges of start states as a kernel struct, `VelocitySettings`.
 
         Angles are in radians, times in policy steps of step_dt [s].
         """
         settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))
-        settings.episode_steps, settings.pace = round(self.episode / step_dt), self.gait * step_dt
+        settings.episode_steps = round(self.episode / step_dt)
+        settings.pace = self.gait * step_dt
         tiles = TileMap()
         tiles.rows, tiles.cols, tiles.tile = self.terrain.rows, self.terrain.cols, self.terrain.tile
         settings.map = tiles

@@ -225,9 +225,7 @@ def test_motor_constant_out_of_range_raises_an_error_that_names_it(name, value):
         MotorKindCfg(**(VALID_KIND | {name: value}))
 
 
-def test_falling_fade_and_zero_worlds_raise_errors():
+def test_falling_fade_raises_an_error():
     kind = MotorKindCfg(**VALID_KIND)
     with pytest.raises(ValueError, match="fade_start"):
         MotorCfg(kind, kind, fade_start=3.0, fade_end=2.0)
-    with pytest.raises(ValueError, match="num_worlds"):
-        motor_arrays(MotorCfg(kind, kind), 0, device="cpu")

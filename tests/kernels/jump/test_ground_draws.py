@@ -255,7 +255,7 @@ def hold(env, steps=20):
     for _ in range(steps):
         env.step(action)
         assert not env.done.any() and not env.robot.diverged.numpy().any()
-    env.sim.physics.write_bodies()
+    env.sim.write_bodies()
 
 
 @pytest.mark.parametrize("start_mode", ["standing", "default"])

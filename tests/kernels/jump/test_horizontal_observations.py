@@ -238,7 +238,7 @@ def test_block_ahead_matches_sampling_along_three_rays():
     env = make_env(256, task=task, reset=only("standing", task.reset.settings), randomize=True, seed=5)
     edit_episodes(env, level=7)  # far goals, most with room for a block
     env.reset()
-    blocks = env.sim.physics.dynamics.robot.ground.blocks.numpy()
+    blocks = env.sim.dynamics.robot.ground.blocks.numpy()
     exists = blocks["exists"] == 1
     assert 40 < exists.sum() < 216
     observed = env.obs[:, -BLOCK:].numpy()

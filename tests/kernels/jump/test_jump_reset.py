@@ -219,7 +219,7 @@ def test_worlds_start_at_different_positions(sampled):
 def test_kinematic_loops_of_starts_are_closed():
     env = make_env(64, reset=ALL_MODES)
     state = env.sim.state
-    env.sim.physics.write_bodies()
+    env.sim.write_bodies()
     newton.eval_fk(env.sim.model, state.joint_q, state.joint_qd, state)
     assert env.sim.loop_gap().max() < 1e-5
 

@@ -162,8 +162,8 @@ def test_simulated_motors_follow_delayed_targets():
     env, oracle = (make_env(len(delays), reset=only("default")) for _ in range(2))
     env.parameters.latency.assign(delays)
     for each in (env, oracle):  # contact iterations from different initial guesses differ by the tolerance
-        each.sim.physics.solver.tolerance = 1.0e-6
-    physics, past = oracle.sim.physics, []
+        each.sim.dynamics.tolerance = 1.0e-6
+    past = []
     initial = env.sim.joint_q()[:, MOTOR_COORDS]
     target = wp.zeros((12, len(delays)), dtype=float, device="cpu")
     for action in 0.3 * random_actions(len(delays), 12, seed=1):
@@ -173,7 +173,7 @@ def test_simulated_motors_follow_delayed_targets():
             when = len(past) - SUBSTEPS + substep - delays
             targets = [past[step][world] if step >= 0 else initial[world] for world, step in enumerate(when)]
             target.assign(np.array(targets).T)
-            physics.advance(1, target)
+            oracle.sim.advance(1, target)
         assert not env.done.any()
         motors, rates = [*range(7), *MOTOR_COORDS], [*range(6), *MOTOR_DOFS]  # base and motors; knees are not written
         np.testing.assert_allclose(env.sim.joint_q()[:, motors], oracle.sim.joint_q()[:, motors], atol=1e-5)  # [rad]

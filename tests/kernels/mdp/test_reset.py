@@ -75,7 +75,7 @@ class Stage(Probe):
 
 def scene_of(sim):
     """Return the kernels' `Scene` of a simulation."""
-    scene, robot = Scene(), sim.physics.dynamics.robot
+    scene, robot = Scene(), sim.dynamics.robot
     scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
     return scene
 

@@ -44,7 +44,7 @@ def robots(sim):
 
 def track(robot, sim, ground=None, settings=None, worlds=None):
     """Launch `track_kernel` on all robots; by default on the simulation's ground, contact above 0.1 N."""
-    n, model = robot.diverged.shape[0], sim.physics.dynamics.robot
+    n, model = robot.diverged.shape[0], sim.dynamics.robot
     settings = skill_settings(0.1) if settings is None else settings
     inputs = [model.geometry, model.ground if ground is None else ground, settings, worlds or new_worlds(n), robot]
     wp.launch(track_kernel, (4, n), inputs, device="cpu")
@@ -85,7 +85,7 @@ def seen_kernel(
 
 def paw_view(robot, sim):
     """Return contact (n, 4), first contact (n, 4), number of contacts (n,) and collisions (n,) of the `RobotView`s."""
-    n, ground = robot.diverged.shape[0], sim.physics.dynamics.robot.ground
+    n, ground = robot.diverged.shape[0], sim.dynamics.robot.ground
     arrays = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.vec4, wp.vec4, int, int)]
     wp.launch(seen_kernel, n, [robot, ground, *arrays], device="cpu")
     return [values.numpy() for values in arrays]
@@ -175,7 +175,7 @@ def poses():
 
 def blocks(n, margin=0.0):
     """Return a random block for each of n worlds, wider on every side and higher by a margin [m]; deterministic."""
-    few = Simulation(8, block=BlockCfg((0.3, -0.2)), visuals=False, device="cpu").physics.dynamics.robot.ground
+    few = Simulation(8, block=BlockCfg((0.3, -0.2)), visuals=False, device="cpu").dynamics.robot.ground
     records = np.tile(few.blocks.numpy(), n // 8)
     records["center"] = np.random.default_rng(8).uniform(-0.6, 0.6, (n, 2))
     records["height"] = np.random.default_rng(9).uniform(0.05, 0.4, n) + margin
@@ -195,7 +195,7 @@ def test_collision_flags_of_all_legs_combined_equal_those_of_the_whole_robot(sim
     robot.joint_q = poses
     track(robot, sim, ground=ground)
     flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
-    geometry = sim.physics.dynamics.robot.geometry
+    geometry = sim.dynamics.robot.geometry
     wp.launch(collision_kernel, n, [geometry, ground, poses, 43, 0.0], [flags, clearance], device="cpu")
     by_leg, expected = robot.collisions.numpy(), flags.numpy()
     np.testing.assert_array_equal(np.bitwise_or.reduce(by_leg, axis=0), expected)
@@ -214,7 +214,7 @@ def test_links_closer_than_self_collision_margin_count_as_touching(sim, poses):
     robot.joint_q = array(high.ravel())
     track(robot, sim, settings=skill_settings(0.1, margin))
     flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
-    model = sim.physics.dynamics.robot
+    model = sim.dynamics.robot
     inputs = [model.geometry, model.ground, robot.joint_q, 43, 2.0 * margin]
     wp.launch(collision_kernel, n, inputs, [flags, clearance], device="cpu")
     near, far = clearance.numpy() < margin - 1e-5, clearance.numpy() > margin + 1e-5
