@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import open_loop_jump
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jump_metrics import LandingPlayFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.viz.film import write_film
 from support.scripts import DeviceArgs, announce, prepare, report, run_script
 

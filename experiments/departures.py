@@ -30,9 +30,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS

@@ -22,12 +22,11 @@ import numpy as np
 import torch
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.conditions import shared_robot
 from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
-from jumper_warp.policies.conditions import shared_robot
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
@@ -269,8 +268,8 @@ class FlightRun(Run):
         PolicyError or CheckpointError: a policy cannot be used, or its task is another one.
         """
         super().__init__()
-        self.turn: Policy = open_policy(args.policy)
-        self.landing: Policy | None = open_policy(landing) if landing else None
+        self.turn: Policy = Policy.load(args.policy)
+        self.landing: Policy | None = Policy.load(landing) if landing else None
         self.recipes = {"the turning policy": self.turn.recipe()}
         turning = self.recipes["the turning policy"].tested_task(randomize=False)
         if turning.evaluation.kind != "attitude":

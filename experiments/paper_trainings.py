@@ -26,14 +26,14 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.suites import Grid
 from jumper_warp.evaluation.velocities import SLEW_RATE, VELOCITY_METRICS, VelocityLog
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import CHECKPOINTS
@@ -160,7 +160,7 @@ def learning_curve(run_folder: Path, num_jumps: int, conditions: Conditions) -> 
     key = PRIMARY[run.evaluation.kind].removeprefix(f"{test}_")
     curve: dict[str, list[float]] = {"iterations": [], "values": []}
     for checkpoint in checkpoints:
-        policy, log = open_policy(checkpoint), make_log(env.task, test, num_jumps)
+        policy, log = Policy.load(checkpoint), make_log(env.task, test, num_jumps)
         policy.to(env.device)
         run_evaluation(policy.act, env, log)
         curve["iterations"].append(int(checkpoint.stem.removeprefix("iteration_")))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.evaluation.attitude import AttitudePlayFlags
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.courses import CourseLog
 from jumper_warp.evaluation.evaluations import PlayFlags
 from jumper_warp.evaluation.jump_metrics import HeightPlayFlags, LandingPlayFlags
@@ -23,9 +24,7 @@ from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
-from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import add_files
+from jumper_warp.policies.catalog import add_files, find_policy
 from jumper_warp.robot.grounds import platform
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError

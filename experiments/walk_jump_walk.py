@@ -22,7 +22,7 @@ from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_cours
 from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.policies.skills import SkillNames
+from jumper_warp.evaluation.skills import SkillNames
 from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from support.scripts import run_script

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.folder import add_files
+from jumper_warp.policies.catalog import add_files
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.files import write_atomically

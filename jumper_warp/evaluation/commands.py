@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
 
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.scripts import read_script
-from jumper_warp.policies.catalog import find_policy, is_run_folder
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import SkillNames
+from jumper_warp.evaluation.skills import SkillNames
+from jumper_warp.policies.catalog import add_files, find_policy, is_run, run_folder
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue
@@ -59,8 +59,6 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     """
     from jumper_warp.evaluation.run import HEADLINES
     from jumper_warp.evaluation.trained import trained_success
-    from jumper_warp.policies.folder import add_files
-    from jumper_warp.policies.runs import is_run
     from jumper_warp.registry import TASKS
 
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
@@ -172,8 +170,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 def played_name(source: str | Path) -> str:
     """Return the name of a policy for titles, or "run RUN" for the folder or a checkpoint of the training run RUN."""
-    folder = Path(source).parent.parent if Path(source).suffix == ".pt" else Path(source)
-    return f"run {folder.resolve().name}" if is_run_folder(folder) else folder.resolve().name
+    name = run_folder(Path(source)).resolve().name
+    return f"run {name}" if is_run(source) else name
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import numpy as np
 from jumper_warp.evaluation.jumps import updated_apex
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
     AXES,
@@ -28,7 +29,6 @@ from jumper_warp.evaluation.velocities import (
     square_sums,
     velocity_series,
 )
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.switching import FALLS

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.policy import Policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.robot.overlay import load_overlay

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 import tyro
 
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.skills import SkillNames, SkillPolicies
 from jumper_warp.evaluation.trained import trained_range
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
@@ -227,9 +227,9 @@ class EvaluationRun(Run):
         """
         super().__init__()
         self.source = source
-        from jumper_warp.policies.runs import open_policy
+        from jumper_warp.policies.policy import Policy
 
-        self.policy = open_policy(source)
+        self.policy = Policy.load(source)
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
         self.evaluation = self.task.evaluation

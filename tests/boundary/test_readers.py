@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.identification.motions import load_motions
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.utils.dumps import load_dump
 from jumper_warp.utils.errors import InputError

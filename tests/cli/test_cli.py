@@ -17,8 +17,7 @@ from jumper_warp.cli.train import parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
-from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.runs import load_policy, open_policy
+from jumper_warp.policies.policy import Policy, load_policy, save_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.cfg import TaskCfg
@@ -284,7 +283,7 @@ def test_refuses_settings_out_of_range(make, message):
 
 
 def test_exported_policy_equals_the_policy_of_the_run(trained_run):
-    policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
+    policy, same = load_policy(trained_run / "policy"), Policy.load(trained_run)
     assert policy.interface == same.interface and policy.interface.sizes == (147, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
     assert policy.recipe().task.curriculum.numbers["promote_after"] == 2
@@ -300,7 +299,7 @@ def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, c
     (empty / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
     code, out, err = run(capsys, "export", str(new.parent))
     assert (code, out, err) == (0, f"{new / 'policy'}\n", [f"{new}: best checkpoint, iteration 2"])
-    assert open_policy(old.parent).interface == load_policy(new / "policy").interface
+    assert Policy.load(old.parent).interface == load_policy(new / "policy").interface
     code, _, err = run(capsys, "evaluate", str(new.parent), "--save-to-policy", "--device", "cpu")
     assert code == 2 and err[-1].endswith(f"{new}: a run keeps no metrics; export it first")
 

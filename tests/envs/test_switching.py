@@ -8,10 +8,10 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.courses import SQUAT_TIME, CourseLog
 from jumper_warp.evaluation.scripts import parse_script
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillPolicies
+from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.overlay import RobotOverlay
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.kernels.jump.state import LANDED
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg

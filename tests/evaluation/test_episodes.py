@@ -5,7 +5,7 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.episodes import EpisodeFlags, command_columns, command_text, episode_metrics
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import Command
 from jumper_warp.tasks.evaluation import EpisodeEvaluation, EpisodeMetric

@@ -11,9 +11,9 @@ from columns import Z
 from experiments import departures
 from experiments.departures import DEPARTURES, ablation_flags, parse, train_or_load
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.tasks.saving import task_from_json, task_to_json

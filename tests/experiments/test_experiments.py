@@ -29,12 +29,12 @@ from experiments import (
     walking_tracking,
 )
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.errors import InputError

@@ -6,6 +6,7 @@ import pytest
 
 from columns import X, Y
 from experiments import paper_tests
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
@@ -19,8 +20,7 @@ from jumper_warp.evaluation.suites import (
     running_positions,
 )
 from jumper_warp.evaluation.sweeps import DistanceSweep
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.utils.output import read_values

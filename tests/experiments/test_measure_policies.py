@@ -14,7 +14,7 @@ from experiments.policy_tables import TABLES, difference_p, filled, main_table, 
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.metrics import MetricValue, mean, rate

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.policies.conditions import Conditions, shared_robot
+from jumper_warp.evaluation.conditions import Conditions, shared_robot
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
@@ -42,11 +42,11 @@ class SkillPolicies:
 
         Raises PolicyError or CheckpointError: one cannot be used, or is for another kind of skill.
         """
-        from jumper_warp.policies.runs import open_policy
+        from jumper_warp.policies.policy import Policy
 
         self.names = SkillNames() if names is None else names
         self.sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
-        self.policies = [open_policy(source) for source in self.sources]
+        self.policies = [Policy.load(source) for source in self.sources]
         self.recipes = [policy.recipe() for policy in self.policies]
         self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
         for task, kind in zip(self.tasks, (VelocityEvaluation, HeightEvaluation, PlaceEvaluation), strict=True):
