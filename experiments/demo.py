@@ -54,7 +54,8 @@ def film_jump(args: Args, folder: Path) -> JumpLog:
 
 def main(args: Args) -> dict[str, Any]:
     """Simulate open-loop jump, paper's tests and filmed jump, print one summary, and return the metrics."""
-    folder, values = prepare("demo", args), {}
+    folder = prepare("demo", args)
+    values = {}
     announce("open-loop jump; the first run compiles kernels for up to a minute")
     (folder / "open_loop").mkdir(exist_ok=True)
     metrics, _ = open_loop_jump.measure(open_loop_jump.Args(device=args.device), folder / "open_loop")

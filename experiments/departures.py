@@ -64,7 +64,8 @@ def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int)
     The levels are every goal range with each of the last `starts` start height ranges.
     goals [m]: lower and upper point of each range; all other fields are those of the task's last level.
     """
-    last, heights = task.levels[-1], [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
+    last = task.levels[-1]
+    heights = [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
     levels = (replace(last, goal_lower=low, goal_upper=top, base_height=z) for low, top in goals for z in heights)
     return replace(task, levels=tuple(levels))
 
@@ -225,7 +226,8 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
 
     arguments: of `jumper train`. Raises InputError: the existing training has other settings.
     """
-    recipe, name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    recipe = parse(ablation, arguments)
+    name = f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
     last = name.format(recipe.train.max_iterations)
     if run := newest(path.parents[1] for path in recipe.train.log_root.glob(f"*/*/{last}")):
         config = json.loads((run / CONFIG).read_text())
@@ -244,7 +246,8 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
 
     args: `Args`; folder: for outputs of the run.
     """
-    run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
+    run = EvaluationRun(checkpoint)
+    ends = make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
     for test, count in zip(TESTS, args.num_jumps, strict=True):
@@ -347,7 +350,8 @@ def main(args: Args) -> dict[str, Any]:
     """Train and evaluate each ablation of a jump task, write results as a table and a plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
-    folder, results = prepare("departures", args, args.threads), {}
+    folder = prepare("departures", args, args.threads)
+    results = {}
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
     for name, seed, ablation in tracked([*args.trainings()], "trainings"):
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))

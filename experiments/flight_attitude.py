@@ -76,12 +76,16 @@ class FlightLog(EvaluationLog):
         self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum above HIGH
         self.tilts: list[np.ndarray] = []  # [rad] (num_envs,) after every policy step, until the end
         self.heights: list[np.ndarray] = []  # [m] (num_envs,) base height after every policy step
-        self._takeoff_step, self._touchdown_step = np.full(n, -1), np.full(n, -1)
-        self._airborne_steps, self._yaw, self._initial_momentum = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
+        self._takeoff_step = np.full(n, -1)
+        self._touchdown_step = np.full(n, -1)
+        self._airborne_steps = np.zeros(n, dtype=int)
+        self._yaw = np.zeros(n)
+        self._initial_momentum = np.zeros((n, 3))
 
     def begin(self, env: Any) -> None:
         """Reset every robot to the default pose, with its commanded apex height."""
-        self.step_dt, goals = env.step_dt, np.zeros((len(self.apex), 3))
+        self.step_dt = env.step_dt
+        goals = np.zeros((len(self.apex), 3))
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
@@ -91,7 +95,8 @@ class FlightLog(EvaluationLog):
         The result is (num_envs, 4), legs FL, FR, BL, BR.
         late: the field `late`.
         """
-        step, n = len(self.tilts), len(self.apex)
+        step = len(self.tilts)
+        n = len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
         delay = late @ (0.5 * LEG_SIGNS.T) / self.step_dt  # [policy steps]
         extended = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
@@ -121,7 +126,8 @@ class FlightLog(EvaluationLog):
         base_pos [m], tilt [rad], turn (size of the yaw [rad]), rise (upward speed [m/s]), spin (angular speed [rad/s]),
         down (whether any paw is on the ground), termination (index), momentum (angular, about the COM [kg m^2/s]).
         """
-        q, qd = env.sim.joint_q(), env.sim.joint_qd()
+        q = env.sim.joint_q()
+        qd = env.sim.joint_qd()
         quat = q[:, 3:7]
         up = 1.0 - 2.0 * (quat[:, 0] ** 2 + quat[:, 1] ** 2)
         forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
@@ -146,7 +152,8 @@ class FlightLog(EvaluationLog):
 
         A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension.
         """
-        step, running = len(self.tilts), self.end < 0
+        step = len(self.tilts)
+        running = self.end < 0
         self._airborne_steps = np.where(arrays["down"], 0, self._airborne_steps + 1)
         earliest, needed = (0, CLEAR) if self.late is None else (RAMP + HOLD, 1)
         rising = (self._airborne_steps >= needed) & (arrays["rise"] > 0.75) & (step >= earliest)
@@ -212,8 +219,11 @@ def flight_metrics(flights: FlightLog) -> Metrics:
 
     Means are over the flights that took off or touched down.
     """
-    up, down, each = "flights that took off", "flights that touched down", "flights"
-    touchdown_tilt, touchdown_turn = np.degrees(flights.touchdown_tilt), np.degrees(flights.touchdown_turn)
+    up = "flights that took off"
+    down = "flights that touched down"
+    each = "flights"
+    touchdown_tilt = np.degrees(flights.touchdown_tilt)
+    touchdown_turn = np.degrees(flights.touchdown_turn)
     error = {"apex_error_abs_mean_m": mean(abs(flights.height - flights.apex), each)}
     return {
         "landed_upright_rate": rate(flights.success, each),
@@ -240,7 +250,8 @@ def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
     They are vectors of length most / 2 to most [s]. A negative delay is one of the back or right legs.
     """
     rng = np.random.default_rng(seed)
-    size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    size = rng.uniform(0.5 * most, most, count)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
@@ -353,7 +364,8 @@ class Args(EvaluationArgs):
 def main(args: Args) -> dict:
     """Simulate the same flights with and without the turning policy, plot tilts and heights, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
-    env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
+    env = run.env(args.num_flights)
+    heights = np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay
     late = extension_delays(args.num_flights, max_delay, args.stream_seed) if args.takeoff == "open-loop" else None
     flights = {

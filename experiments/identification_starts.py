@@ -92,12 +92,14 @@ def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]
     robot, noise: indices of the robot with its motions, and of the noise of its sensors and scale.
     """
     configure_device("cpu", 1)
-    parameters, replay = jumper_parameters(), MotionReplay(device="cpu", threads=1)
+    parameters = jumper_parameters()
+    replay = MotionReplay(device="cpu", threads=1)
     rng, noise_rng = (
         np.random.default_rng(seed) for seed in ([STREAMS[stream], robot], [STREAMS[stream], robot, 1 + noise])
     )
     truth = far_robot(parameters, rng)
-    robots, described = parameters.robots(truth), parameters.robots(np.zeros_like(truth))
+    robots = parameters.robots(truth)
+    described = parameters.robots(np.zeros_like(truth))
     simulate = partial(replay_plan, MotionReplay(device="cpu", threads=1))
     motions = []
     while len(motions) < len(KINDS):
@@ -109,7 +111,8 @@ def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]
     mass = weighed_mass(float(total_mass(robots)[0]) + SCALE_STD * mass_error, SCALE_STD)
     result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
     error = np.abs(result.z - truth)[result.identified] / result.std[result.identified]
-    outside, worst = int((error > CONFIDENCE).sum()), float(error.max())
+    outside = int((error > CONFIDENCE).sum())
+    worst = float(error.max())
     names = np.array(parameters.names)[result.identified]
     return {
         "robot": robot, "noise": noise, "consistent": result.consistent, "inconsistency": result.inconsistency,

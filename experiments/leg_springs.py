@@ -58,7 +58,8 @@ class SpringJumps:
         robots.spring_stiffness[:, 0] = np.repeat(stiffness, shape[1])
         robots.spring_length[:, 0] = self.length
         sim = self.simulation(shape[0] * shape[1], robots, visuals=False)
-        apex, extend_step = np.zeros(sim.num_worlds), STAND + RAMP + HOLD
+        apex = np.zeros(sim.num_worlds)
+        extend_step = STAND + RAMP + HOLD
         for tick in range(extend_step + EXTEND + FALLING):
             commands = [transversal_command(min(tick, extend_step + EXTEND - 1), squat) for squat in squats]
             sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
@@ -117,7 +118,8 @@ def main(args: Args) -> dict:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
             apexes = jumps.apexes(args.stiffness, args.squat_angles)
-            best, top = apexes.max(axis=1), int(apexes.max(axis=1).argmax())
+            best = apexes.max(axis=1)
+            top = int(apexes.max(axis=1).argmax())
             squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
                        f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip

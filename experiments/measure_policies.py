@@ -151,9 +151,12 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
         flags = ["--seed", str(seed), *(["--device", args.device] if args.device else [])]
         run_test(policy, condition, args.row(policy, condition, seed), flags)
         return read_values(args.row(policy, condition, seed))
-    run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition][1])
+    run = EvaluationRun(policy)
+    folder = args.row(policy, condition, seed)
+    values = dict(CONDITIONS[condition][1])
     if payload := values.pop("payload", None):
-        run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
+        run.settings["payload_kg"] = payload
+        values["robot"] = folder / "payload.json"
         folder.mkdir(parents=True, exist_ok=True)
         payload_overlay(run.recipe.robot, payload).save(values["robot"])
     conditions = Conditions(**values, seed=seed, device=args.device, threads=args.threads)

@@ -36,7 +36,8 @@ def main(args: Args) -> dict:
 
     Keys: `<policy>_<suite>_<key>`.
     """
-    folder, paper = output_dir("paper_tests", args.out), {}
+    folder = output_dir("paper_tests", args.out)
+    paper = {}
     metrics: Metrics = {}
     for policy in args.policies:
         for name, suite in suites_for(EvaluationRun(policy).task).items():

@@ -137,7 +137,8 @@ def metrics_of(run: EvaluationRun, log: EvaluationLog) -> Metrics:
 
 def evaluate_arm(checkpoint: Path, folder: Path, num_jumps: int, conditions: Conditions) -> Metrics:
     """Run the paper's tests of a policy on nominal and noisy, randomised robots; keys: `<robots>_<test>_<metric>`."""
-    run, metrics = EvaluationRun(checkpoint), {}
+    run = EvaluationRun(checkpoint)
+    metrics = {}
     run.prepare("paper_trainings", conditions, folder)
     for robots in (NOMINAL, RANDOMIZED):
         drawn = robots == RANDOMIZED
@@ -160,7 +161,8 @@ def learning_curve(run_folder: Path, num_jumps: int, conditions: Conditions) -> 
     key = PRIMARY[run.evaluation.kind].removeprefix(f"{test}_")
     curve: dict[str, list[float]] = {"iterations": [], "values": []}
     for checkpoint in checkpoints:
-        policy, log = Policy.load(checkpoint), make_log(env.task, test, num_jumps)
+        policy = Policy.load(checkpoint)
+        log = make_log(env.task, test, num_jumps)
         policy.to(env.device)
         run_evaluation(policy.act, env, log)
         curve["iterations"].append(int(checkpoint.stem.removeprefix("iteration_")))
@@ -317,7 +319,8 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
 
 def main(args: Args) -> dict[str, Any]:
     """Run and test all trainings in turn, print a table, plot learning curves; return the primary metric of each."""
-    folder, results = prepare("paper_trainings", args, args.threads), {}
+    folder = prepare("paper_trainings", args, args.threads)
+    results = {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")
         key = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation.kind]}"

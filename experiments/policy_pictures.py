@@ -99,12 +99,15 @@ class Args(ThreadArgs):
 def record(name: str) -> Recording:
     """Simulate an episode of a policy, or for COURSE a walk with jumps by three policies, and return the recording."""
     if name == COURSE:
-        run, log = SkillRun(), CourseLog([read_script(SCRIPT)])
-        env, ground = run.env(1), "plane"
+        run = SkillRun()
+        log = CourseLog([read_script(SCRIPT)])
+        env = run.env(1)
+        ground = "plane"
     else:
         shot = SHOTS[name]
         run = EvaluationRun(name)
-        log, ground = shot.flags.log(run.evaluation.prepare_task(run.task)), shot.ground()
+        log = shot.flags.log(run.evaluation.prepare_task(run.task))
+        ground = shot.ground()
         env = run.env(log.count, conditions=Conditions(friction=shot.friction), ground=ground)
     recorder = EnvRecorder(env, log, [0], ground=ground, notes={"task": name})
     run_evaluation(run.actor(env), env, log, on_step=recorder)

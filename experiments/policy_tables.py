@@ -70,7 +70,8 @@ def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
     """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
     if pair := values.get("trained_range_m"):
         levels: Any = task.levels
-        aside, back = max(level.goal_upper[1] for level in levels), -min(level.goal_lower[0] for level in levels)
+        aside = max(level.goal_upper[1] for level in levels)
+        back = -min(level.goal_lower[0] for level in levels)
         if kind_of(task) == "height":
             return "{:g} to {:g} m".format(*pair)
         if back > 0.0:
@@ -95,7 +96,8 @@ def number(key: str, value: Any) -> str:
 
 def cell(column: Sequence[str], metrics: Results) -> str:
     """Format a cell of a table, empty if the metrics lack all keys; column: title and keys, ± adds the interval."""
-    text, interval = [], None
+    text = []
+    interval = None
     for key in column[1:]:
         if metric := metrics.get(key.removeprefix("±")):
             text.append(number(key, metric.value))
@@ -122,11 +124,13 @@ def first_seed(policy: str) -> dict[str, Row]:
 
 def main_table(policy: str, task: TaskCfg) -> str:
     """Return the main table of a policy: metrics as rows, conditions and published results as columns."""
-    rows, paper = first_seed(policy), published(task)
+    rows = first_seed(policy)
+    paper = published(task)
     single = [(title, rows[name].metrics) for name, title in SHOWN.items() if name in rows]
     single += [(words, metrics) for words, metrics in paper if not words.startswith(ON_ROBOT)]
     robot = {words.removeprefix(ON_ROBOT): metrics for words, metrics in paper if words.startswith(ON_ROBOT)}
-    titles, together = [title for title, _ in single], ON_ROBOT.strip(", ")
+    titles = [title for title, _ in single]
+    together = ON_ROBOT.strip(", ")
     lines = []
     for line in PAGES["main"][kind_of(task)]:
         cells = [line[0], *(cell(line, metrics) for _, metrics in single)]
@@ -142,7 +146,8 @@ def main_table(policy: str, task: TaskCfg) -> str:
 
 def all_conditions(policy: str, task: TaskCfg) -> str:
     """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
-    rows, wide = first_seed(policy), PAGES["wide"][kind_of(task)]
+    rows = first_seed(policy)
+    wide = PAGES["wide"][kind_of(task)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
     nominal = rows["nominal"]
@@ -179,9 +184,12 @@ def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
     """Return a Markdown table with a policy for each need: tested and trained commands, success, error, limits."""
     lines = []
     for need in PAGES["needs"]:
-        policy, tests = need["policy"], need.get("tests", ("nominal", "randomised", "friction_0.4"))
-        rows, task = first_seed(policy), tasks[policy]
-        page, values = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)], rows[tests[0]].values
+        policy = need["policy"]
+        tests = need.get("tests", ("nominal", "randomised", "friction_0.4"))
+        rows = first_seed(policy)
+        task = tasks[policy]
+        page = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)]
+        values = rows[tests[0]].values
         speed = values.get("speed_m_s")
         tested = str(values["commands"]) if speed is None else f"bumps, slopes, steps at {speed} m/s"
         cells = [_success(rows[test], kind_of(task)) if test in rows else "" for test in tests]
@@ -197,8 +205,10 @@ def _success(row: Row, kind: str) -> str:
         rates = [metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate")]
         parts = [f"{number('fall_rate', max(rate for rate in rates if isinstance(rate, float)))} fall"]
     else:
-        rate, (key, factor, text) = RATES.get(kind, "success_rate"), ERRORS[kind]
-        share, error = number(rate, row.metrics[rate].value).replace("100.0", "100"), row.metrics[key].value
+        rate = RATES.get(kind, "success_rate")
+        (key, factor, text) = ERRORS[kind]
+        share = number(rate, row.metrics[rate].value).replace("100.0", "100")
+        error = row.metrics[key].value
         assert isinstance(error, float)
         parts = [share + " fall" * (kind == "velocity"), text.format(factor * error)]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
@@ -223,7 +233,9 @@ def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
     (p, n), (q, m) = ((float(x.value), int(x.trials or 0)) for x in (a, b))  # pyright: ignore[reportArgumentType]
     if key.endswith("_rate"):
         pooled = (p * n + q * m) / (n + m)
-        v, w, survival = pooled * (1.0 - pooled) / n, pooled * (1.0 - pooled) / m, scipy.stats.norm.sf
+        v = pooled * (1.0 - pooled) / n
+        w = pooled * (1.0 - pooled) / m
+        survival = scipy.stats.norm.sf
     else:
         v, w = (((x.interval[1] - x.interval[0]) / (2.0 * Z)) ** 2 if x.interval else 0.0 for x in (a, b))
         freedom = (v + w) ** 2 / max(v**2 / (n - 1) + w**2 / (m - 1), 1.0e-300)
@@ -253,7 +265,8 @@ def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
 def seed_section(rows: Sequence[Row]) -> str:
     """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
     tests = sorted(seed_tests(rows), key=lambda test: test.p)
-    count, compared = len(tests), len({test[:2] for test in tests})
+    count = len(tests)
+    compared = len({test[:2] for test in tests})
     significant = [test for test in tests if test.p * count < LEVEL]
     text = (
         f"{compared} rows were measured with two seeds. Each of their {count:,} rates and means was compared:\n"
@@ -304,7 +317,8 @@ class Args:
 
 def main(_: Args) -> int:
     """Make the tables of all pages, print the paths of the pages that changed, and return their number."""
-    tasks, changed = tasks_of(policy_tasks()), []
+    tasks = tasks_of(policy_tasks())
+    changed = []
     for path in pages():
         old = path.read_text(encoding="utf-8")
         if (new := filled(old, tasks)) != old:

@@ -47,10 +47,14 @@ def soak(env: Env, args: Args) -> dict[str, float]:
     """
     env.reset()
     assert isinstance(env.sim.solver, SolverJumper)
-    residual, tolerance = wp.to_torch(env.sim.solver.residual), env.sim.solver.tolerance
+    residual = wp.to_torch(env.sim.solver.residual)
+    tolerance = env.sim.solver.tolerance
     q, qd = (wp.to_torch(x).view(env.num_envs, -1) for x in (env.sim.state.joint_q, env.sim.state.joint_qd))
-    termination, diverged = wp.to_torch(env.episodes.termination), env.task.termination_names.index("diverged")
-    action, counts, speeds = torch.zeros_like(env.action), torch.zeros_like(qd[0, :3]).double(), qd.new_zeros(2)
+    termination = wp.to_torch(env.episodes.termination)
+    diverged = env.task.termination_names.index("diverged")
+    action = torch.zeros_like(env.action)
+    counts = torch.zeros_like(qd[0, :3]).double()
+    speeds = qd.new_zeros(2)
 
     def step_held() -> None:
         """Take `args.hold_steps` steps with one random action; after each, count worlds and update largest speeds."""
@@ -77,7 +81,8 @@ def soak(env: Env, args: Args) -> dict[str, float]:
 
 def main(args: Args) -> dict[str, Any]:
     """Soak-test the environments of all tasks in turn, and return the sums and largest values of their metrics."""
-    folder, start = prepare("soak_test", args, args.threads), time.perf_counter()
+    folder = prepare("soak_test", args, args.threads)
+    start = time.perf_counter()
     total: dict[str, Any] = {}
     for name in args.tasks or task_names():
         torch.manual_seed(args.seed)

@@ -83,11 +83,13 @@ class MotionReplay:
         self.problem = problem
         self.sim = Simulation(1, motors=problem.motors, command_filter=problem.command_filter,
                               friction=problem.friction, gravity=problem.gravity, device=problem.device)  # fmt: skip
-        self.targets, self.recorder = targets, Recorder(self.sim.model, notes=notes)
+        self.targets = targets
+        self.recorder = Recorder(self.sim.model, notes=notes)
         rows: list[tuple] = []
         self.states = [compact(self.sim.joint_q(), self.sim.joint_qd())]
         self.impulses: list[np.ndarray] = []
-        self.flags, self.work = 0, 0.0
+        self.flags = 0
+        self.work = 0.0
         for target in targets:
             self.sim.set_targets(target)
             self.sim.filter_targets()
@@ -107,7 +109,8 @@ class MotionReplay:
         sim = self.sim
         before = motor_values(sim.joint_qd()[0, 6:])
         sim.physics_step()
-        q, qd = sim.joint_q()[0], sim.joint_qd()[0]
+        q = sim.joint_q()[0]
+        qd = sim.joint_qd()[0]
         torque = sim.torque.numpy()[:, 0].copy()
         power = torque * 0.5 * (before + motor_values(qd[6:]))
         self.impulses.append(sim.dt * sim.paw_force.numpy())
@@ -128,7 +131,8 @@ class MotionReplay:
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
         self.states.append(compact(sim.joint_q(), sim.joint_qd()))
-        flags, clearance = wp.zeros(1, dtype=int, device=sim.device), wp.zeros(1, dtype=float, device=sim.device)
+        flags = wp.zeros(1, dtype=int, device=sim.device)
+        clearance = wp.zeros(1, dtype=float, device=sim.device)
         robot = sim.physics.dynamics.robot
         wp.launch(
             collision_kernel, dim=1, inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
@@ -156,7 +160,9 @@ class MotionReplay:
         ups = np.diff(self.up[ticks][max(self.takeoff - 1, 0) :], prepend=self.up[ticks][max(self.takeoff - 1, 0)])
         self.hardest = float(ups.max() / (self.sim.substeps * self.sim.dt * EARTH))
         """[g] Largest upward acceleration of the base over a policy step after takeoff, g of Earth."""
-        self.longest_lift, self.highest_lift, self.touched = 0.0, 0.0, 0
+        self.longest_lift = 0.0
+        self.highest_lift = 0.0
+        self.touched = 0
         """[s] and [m] Longest time and largest height of a paw lifted after touchdown; number of paws that touched."""
         for leg in range(4):
             later = np.flatnonzero(down[first:, leg])
@@ -229,8 +235,10 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 
     The extension begins around step `push`, separately for front and hind legs; left and right are equal.
     """
-    shape, step = (count, 1, 4), np.array(knots.at)[None, :, None]
-    first, second = rng.uniform(-1.0, 1.0, shape), rng.uniform(-0.2, 1.0, shape)
+    shape = (count, 1, 4)
+    step = np.array(knots.at)[None, :, None]
+    first = rng.uniform(-1.0, 1.0, shape)
+    second = rng.uniform(-0.2, 1.0, shape)
     switch_step = rng.uniform(8.0, push - 4.0, (count, 1, 1))
     extend_step = np.repeat(rng.uniform(push - 8.0, push + 8.0, (count, 1, 2)), 2, axis=2)
     return np.where(step < extend_step, np.where(step < switch_step, first, second), -1.0).reshape(count, -1)
@@ -242,7 +250,8 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
     The robot leans back, falls forward, crouches, extends the hind legs, then the front legs. Postures scatter around
     POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
-    step, shape = np.array(knots.at)[None, :, None], (count, 1, 1)
+    step = np.array(knots.at)[None, :, None]
+    shape = (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
     hind = rng.uniform(push - 5.0, push + 3.0, shape)
     front = hind + rng.uniform(0.0, 4.0, shape)
@@ -316,7 +325,8 @@ def _far(
         jumps.landing_pitch(pitch), jumps.stays(away, TAKEOFF_SPEED), jumps.clear(speed=TAKEOFF_SPEED),
         jumps.no_run_up(AHEAD), jumps.takes_off(TAKEOFF_SPEED),
     )  # fmt: skip
-    far, back = jumps.farthest(TAKEOFF_SPEED), jumps.leans_back(BACK, TAKEOFF_SPEED)
+    far = jumps.farthest(TAKEOFF_SPEED)
+    back = jumps.leans_back(BACK, TAKEOFF_SPEED)
     objective = (lambda motion: far(motion) + lean * back(motion)) if lean else far
     return Problem(FORWARD_KNOTS, objective, constraints, motors_of(torque, speed), command_filter(), **settings)
 
@@ -413,8 +423,10 @@ def optimise(
     costs: list[torch.Tensor] = []
     candidates = begin
     for number, (how, stage) in enumerate(jump.stages):
-        problem, record = problems[str(how)], lambda _, last: costs.append(last)
-        candidates = smoothed(problem, candidates, stages=(stage,), seed=seed + number, callback=record)
+        problem = problems[str(how)]
+        candidates = smoothed(
+            problem, candidates, stages=(stage,), seed=seed + number, callback=lambda _, last: costs.append(last)
+        )
         best = float(costs[-1][0])
         announce(f"{jump.label}, stage {number + 1} of {len(jump.stages)}: cost with penalties {best:.3f}")
     progress = minimise(problems[str(FINE)], candidates, iterations=polish, step=0.01, seed=seed)
@@ -452,9 +464,12 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
 
     best: solutions (len(knots),) by name of the jump; one may start this search, and the new one is added.
     """
-    jump, wall, cpu = ALL_JUMPS[name], time.perf_counter(), time.process_time()
+    jump = ALL_JUMPS[name]
+    wall = time.perf_counter()
+    cpu = time.process_time()
     settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
-    knots, rng = jump.make(**FINE, **settings).knots, np.random.default_rng(args.seed)
+    knots = jump.make(**FINE, **settings).knots
+    rng = np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
         begin = np.concatenate([begin, noisy_variants(best[jump.after], knots, rng)])
@@ -471,7 +486,8 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
 def main(args: Args) -> dict[str, Any]:
     """Optimise the jumps in order, write their replays, and return the metrics."""
     torch.set_num_threads(1)  # arrays of torch are small; the simulated worlds use the cores
-    folder, best = prepare("trajectory_optimization", args, args.threads), {}
+    folder = prepare("trajectory_optimization", args, args.threads)
+    best = {}
     replays: dict[str, MotionReplay] = {}
     values: dict[str, Any] = {}
     for name in tracked(args.jumps, "optimising jumps"):

@@ -63,7 +63,8 @@ def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
 
 def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
     """Return the sequence of commands of the paper's test: random walks, a jump up, walks, a jump ahead, walks."""
-    up, ahead = ScriptStep("jump_up", (HEIGHT,)), ScriptStep("jump_to", (DISTANCE, 0.0))
+    up = ScriptStep("jump_up", (HEIGHT,))
+    ahead = ScriptStep("jump_to", (DISTANCE, 0.0))
     before, between, after = (random_walks(rng, count) for count in WALKS)
     return [*before, up, *between, ahead, *after]
 
@@ -92,7 +93,8 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return one script of walks and jumps per robot."""
-    rng, blocks = np.random.default_rng(args.stream_seed), args.blocks and args.solver == "jumper"
+    rng = np.random.default_rng(args.stream_seed)
+    blocks = args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 

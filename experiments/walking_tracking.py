@@ -97,10 +97,12 @@ def gait_metrics(
     """
     apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
                                            for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
-    seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
+    seconds = len(contact) * step_dt
+    robots = max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
     transport = power.mean(axis=0)
-    load, mean_speed = force.sum(axis=2) / weight, speed.mean(axis=0)
+    load = force.sum(axis=2) / weight
+    mean_speed = speed.mean(axis=0)
     metrics: dict[str, float | None] = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
         "swing_apex_median_m": float(np.median(apexes)) if len(apexes) else None,
@@ -123,7 +125,8 @@ def gait_metrics(
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Return the largest height [m] in each complete swing of one paw, (swings,); contact, height [m]: (steps,)."""
     edges = np.diff(contact.astype(int))
-    lifts, lands = np.flatnonzero(edges == -1) + 1, np.flatnonzero(edges == 1) + 1
+    lifts = np.flatnonzero(edges == -1) + 1
+    lands = np.flatnonzero(edges == 1) + 1
     lands = lands[lands > lifts[0]] if len(lifts) else lands[:0]
     return np.array([height[a:b].max() for a, b in zip(lifts, lands, strict=False)])
 
@@ -180,7 +183,8 @@ class KickedWalks(VelocityLog):
 def kicked_walks(env: Env, rng: np.random.Generator) -> KickedWalks:
     """Return an empty log for walks of 7 s with a random command, and a kick in a random direction after 2 to 4 s."""
     n = env.num_envs
-    commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
+    commands = rng.uniform(-REACH, REACH, (n, 1, 3))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return KickedWalks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
 
@@ -222,7 +226,8 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles, or falls.
     hold [s]: time for which the velocity must stay; None: to the end, so that later pushes count too.
     """
-    window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
+    window = round(SMOOTHING / walks.step_dt)
+    first = round(walks.times[-1] / walks.step_dt)
     velocity = walks.velocity_history()[..., :2]
     total = np.cumsum(velocity, axis=0)
     smooth = velocity.copy()
@@ -254,7 +259,8 @@ def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width
     Robots are grouped by commanded speed into bins of a width; the result is the largest command of its bin.
     commanded, width [m/s] or [rad/s]; commanded: (robots,), at least 0; kept: (robots,) bool, of `kept_speeds`.
     """
-    bins, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
+    bins = np.floor(commanded / width + 1.0e-9).astype(int)
+    top = 0.0
     for number in np.unique(bins):
         inside = bins == number
         if kept[inside].mean() >= share:
@@ -312,13 +318,15 @@ def main(args: Args) -> dict:
     rng = np.random.default_rng(args.stream_seed)
     flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
     log = flags.log(run.task, args.stream_seed)
-    walks, env = run.run_episodes(run.env(log.count), log), run.env(args.commands_per_axis**3)
+    walks = run.run_episodes(run.env(log.count), log)
+    env = run.env(args.commands_per_axis**3)
     redirected = run.run_episodes(env, redirected_walks(env, rng), film="walk")
     settling = settling_times(redirected)
     fast, direction = sped_up_walks(env)
     run.run_episodes(env, fast)
     kicked = run.run_episodes(env, kicked_walks(env, rng))
-    straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), GaitRecorder(env)
+    straight = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task)
+    gait = GaitRecorder(env)
     run.run_episodes(env, straight, on_step=gait)
     plot_tracking(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(redirected, HOLD)))

@@ -146,7 +146,8 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
     jump = GradientJump(1, double=True, device=device)
     trajectory, grads = jump.gradients({})
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
-    coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
+    coords = [2, 3, 4, 5, *range(7, 19)]
+    rates = list(range(18))
 
     def compare(gradient: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> GradientPair:
         """Pair derivatives of the apex along directions of an input with their central differences."""

@@ -73,9 +73,11 @@ class MomentumRecorder:
         Diverged robots are left out.
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
         """
-        drift, over = np.array(self.angular)[:, ~diverged], "turns that did not diverge"
+        drift = np.array(self.angular)[:, ~diverged]
+        over = "turns that did not diverge"
         turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
-        size, turn = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
+        size = np.linalg.norm(drift, axis=-1)
+        turn = np.degrees(np.linalg.norm(turned, axis=-1))
         return {
             "angular_momentum_max_nm_s": largest(size.max(axis=0), over),
             "angular_momentum_at_end_mean_nm_s": mean(size[-1], over),

@@ -71,7 +71,8 @@ def ordered_rows(policy: str, saved: Iterable[tuple[str, int, Mapping[str, Any]]
 
     The JSON data have the keys `conditions` and `metrics`.
     """
-    rows, order = [], [*CONDITIONS, *TESTS]
+    rows = []
+    order = [*CONDITIONS, *TESTS]
     for condition, seed, data in saved:
         metrics = {key: MetricValue(x["value"], x["trials"], x["interval"] and tuple(x["interval"]), x["over"])
                    for key, x in data["metrics"].items()}  # fmt: skip

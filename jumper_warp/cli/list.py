@@ -49,9 +49,11 @@ def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[dict[str, An
     """Return the description of every task as JSON data, and a line for each package whose task cannot be loaded."""
     from jumper_warp.registry import TASKS, installed_tasks, load_installed, package_of
 
-    packages, failures = {}, []
+    packages = {}
+    failures = []
     for entry_point in installed_tasks():
-        name, package = entry_point.name, package_of(entry_point)
+        name = entry_point.name
+        package = package_of(entry_point)
         try:
             load_installed(entry_point)
             packages[name] = package

@@ -121,7 +121,9 @@ def user_file_error(folders: Collection[str], error: Exception) -> str | None:
 
 def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the arguments without `--task-module NAME`, and all NAMEs. Raises UsageError: a value is missing."""
-    rest, names, remaining = [], [], iter(args)
+    rest = []
+    names = []
+    remaining = iter(args)
     for arg in remaining:
         flag, equals, name = arg.partition("=")
         if flag.replace("_", "-") != TASK_MODULE:

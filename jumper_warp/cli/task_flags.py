@@ -67,7 +67,9 @@ def _flag(value: Any, hint: Any, where: str) -> Setting | None:
 
 def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
     """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
-    hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
+    hints = get_type_hints(type(value))
+    docs = field_docs(type(value))
+    flags = {}
     for name, part in _parts(value).items():
         flag = _flag(part, hints[name], f"{where} {name}")
         if flag is not None:

@@ -150,14 +150,17 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     from jumper_warp.evaluation.recorder import EnvRecorder
     from jumper_warp.evaluation.trained import warn_beyond_resets, warn_beyond_training
 
-    flags, name = cfg.flags, run.policy.interface.task
+    flags = cfg.flags
+    name = run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
     warn_beyond_training(run.task, log.all_commands())
-    env, worlds = run.env(log.count), range(log.count)
+    env = run.env(log.count)
+    worlds = range(log.count)
     notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, log, worlds, notes=notes)
-    seconds, stop = cfg.seconds or flags.length, cfg.seconds is None
+    seconds = cfg.seconds or flags.length
+    stop = cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):

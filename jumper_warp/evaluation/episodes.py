@@ -41,9 +41,11 @@ class EpisodeLog(EvaluationLog):
 
     def __post_init__(self) -> None:
         self.count = count = len(self.commands)
-        self.end, self.length = np.full(count, -1), np.zeros(count)
+        self.end = np.full(count, -1)
+        self.length = np.zeros(count)
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
-        self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
+        self._height_sum = np.zeros(count)
+        self._steps = np.zeros(count, dtype=int)
         self._start: dict[str, np.ndarray] = {}  # Sampled numbers of the task's state at the start, (num_envs,) each
         own: Any = self.task.evaluation  # an `EpisodeEvaluation`
         self.metrics, self.goal_marker = own.metrics, own.goal_marker
@@ -178,7 +180,9 @@ def episode_metrics(episodes: EpisodeLog, count: int | None = None) -> Metrics:
 
     `ended_by_<outcome>_rate` is the rate of a termination. count: number of episodes to measure (default: all).
     """
-    running, over, displacement = episodes.end[:count] < 0, "episodes", episodes.displacement[:count]
+    running = episodes.end[:count] < 0
+    over = "episodes"
+    displacement = episodes.displacement[:count]
     success, timed_out = (episodes.ended_with(option)[:count] for option in ("success", "time_out"))
     return {
         "success_termination_rate": rate(success, over),

@@ -38,7 +38,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
     if PUSH_PROBABILITY in params.names:
         env.set(PUSH_PROBABILITY, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
+    apex = np.zeros(env.num_envs)
+    diverged = np.zeros(env.num_envs, dtype=bool)
     with phase(f"simulating {env.num_envs} open-loop jumps", len(LEVELS)) as advance:
         for step, level in enumerate(LEVELS.tolist()):
             env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))

@@ -42,11 +42,14 @@ class EnvRecorder:
         from jumper_warp.sim.links import LinkReader
         from jumper_warp.viz.recorder import Recorder
 
-        self.env, self.log, self.worlds = env, log, list(worlds)
+        self.env = env
+        self.log = log
+        self.worlds = list(worlds)
         self.links = LinkReader(env.sim)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
         model = build_model(len(worlds), ground=ground, device=env.wp_device, mujoco=False)
-        labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
+        labels = log.names(self.worlds)
+        notes = {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)
@@ -54,7 +57,8 @@ class EnvRecorder:
 
     def __call__(self) -> None:
         """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
-        sim, log = self.env.sim, self.log
+        sim = self.env.sim
+        log = self.log
         poses = self.links.read()[0][self.worlds]
         forces = peak_forces(sim)[self.worlds]
         if self.block is not None:
@@ -75,8 +79,10 @@ class EnvRecorder:
 
         Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
         """
-        world, sim = self.worlds[0], self.env.sim
-        peak, torque = sim.physics.peak_paw_force.numpy()[:, world], sim.torque.numpy()[:, world]
+        world = self.worlds[0]
+        sim = self.env.sim
+        peak = sim.physics.peak_paw_force.numpy()[:, world]
+        torque = sim.torque.numpy()[:, world]
         action = self.env.action[world].cpu().numpy()
         series = {f"peak paw force/{leg} [N]": peak[i] for i, leg in enumerate(LEGS)}
         series |= {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}

@@ -86,9 +86,13 @@ class Run(ABC):
         from jumper_warp.robot.model import PHYSICS_DT
 
         self.started = time.perf_counter()
-        self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
+        # Conditions of all episodes; number of worlds to record
+        self.conditions = Conditions()
+        self.record = 0
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
-        self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
+        # Name of the evaluation; what `report` prints
+        self.name = ""
+        self.print_flags = PrintFlags()
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
@@ -117,7 +121,10 @@ class Run(ABC):
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials, self.name = conditions, record, save_trials, name
+        self.conditions = conditions
+        self.record = record
+        self.save_trials = save_trials
+        self.name = name
         self.folder = output_dir(name, out)
 
     @property
@@ -138,7 +145,8 @@ class Run(ABC):
     @property
     def condition_values(self) -> dict[str, Any]:
         """Conditions of the evaluation by name, without unset ones; with the latencies of the episodes so far."""
-        conditions, values = self.conditions, {**self.settings}
+        conditions = self.conditions
+        values = {**self.settings}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
@@ -169,7 +177,8 @@ class Run(ABC):
         film: name of the recording and picture of `record` evenly spaced worlds; empty: none. film_scene: the
         environment's `ground` and `block` for the recording. on_step: called with the log after every policy step.
         """
-        recorder, scene = None, film_scene or {}
+        recorder = None
+        scene = film_scene or {}
         if film and self.record:
             worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
             recorder = EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
@@ -195,7 +204,8 @@ class Run(ABC):
 
     def summarise(self, report: Report, count: str, keys: Iterable[str], **settings: Any) -> None:
         """Print a summary of a report; count: number and kind of trials; settings: see `print_summary`."""
-        name, count = self.name.replace("_", " "), f"{count}, " if count else ""
+        name = self.name.replace("_", " ")
+        count = f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
         what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
@@ -264,7 +274,8 @@ class EvaluationRun(Run):
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
         """
-        change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
+        change = change or self.evaluation.prepare_task
+        conditions = conditions or self.conditions
         env = env_of_recipe(self.recipe, count, conditions, change=change, **scene)
         self.policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
@@ -317,7 +328,8 @@ def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
     """Format latencies (num_envs,) [physics steps of physics_dt s] in ms and steps: one value, or range and mean."""
-    least, most = int(np.min(steps)), int(np.max(steps))
+    least = int(np.min(steps))
+    most = int(np.max(steps))
     low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
     if least == most:
         return f"{low} ms ({least} physics step{'' if least == 1 else 's'})"

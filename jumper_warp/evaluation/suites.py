@@ -117,7 +117,8 @@ class Ring(Suite):
         landings = self.run_landings(run, goals, film="jumps")
         plot(run, "landings", f"Jumps over {self.radius:g} m", {"": landings}, f"{self.num_jumps} jumps")
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
-        rows, values = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate"), jump_metrics(landings.outcome)
+        rows = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate")
+        values = jump_metrics(landings.outcome)
         for i, name in enumerate(SECTORS):
             values |= measure(rows, landings.outcome, sector == i, f"{name}_", name)
         return values
@@ -152,7 +153,8 @@ class Consecutive(Suite):
         rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
-        logs, paths = [], []
+        logs = []
+        paths = []
         for name, goals in (("pairs", pairs), ("row", rows)):
             positions: list[np.ndarray] = []
             logs.append(self.run_landings(
@@ -185,7 +187,8 @@ def consecutive_metrics(pairs: JumpLog, row: JumpLog) -> Metrics:
     """
     first, rows = pairs.outcome, row.outcome
     errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
-    halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
+    halves = np.arange(2).repeat(len(first.landed) // 2)[:, None]
+    numbers = np.arange(2)
     return {
         **jump_metrics(first),
         **{key: value for i, name in enumerate(PAIRS)
@@ -220,7 +223,8 @@ class Platform(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = 0.3, GROUND_LOWER[0]
+        low = 0.3
+        high = GROUND_LOWER[0]
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
     def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
@@ -250,7 +254,8 @@ class Platform(Suite):
         """Run the jumps of all scenes, plot them, and return the metrics as `<scene>_<key>`."""
         rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
-        run.settings["edge_m"], values = self.edge, {}
+        run.settings["edge_m"] = self.edge
+        values = {}
         done: dict[str, JumpLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
             env = run.env(self.num_jumps, **scene)
@@ -259,7 +264,8 @@ class Platform(Suite):
             if "block" in scene:
                 slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
                 values |= {"block_slide_mean_m": mean(slide, "jumps"), "block_slide_max_m": largest(slide, "jumps")}
-        words, outlines = f"{self.num_jumps} jumps each", self.outlines(goals)
+        words = f"{self.num_jumps} jumps each"
+        outlines = self.outlines(goals)
         plot(run, "landings", "Jumps to other grounds", done, words, outlines=outlines)
         return values
 
@@ -287,7 +293,9 @@ class Farthest(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        near, far, limits = self.min_distance, self.max_distance, f"0.1 <= min_distance <= max_distance <= {LIMIT:g} m"
+        near = self.min_distance
+        far = self.max_distance
+        limits = f"0.1 <= min_distance <= max_distance <= {LIMIT:g} m"
         check(0.1 <= near <= far <= LIMIT, f"need {limits}, got {near} and {far}")
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
@@ -299,7 +307,8 @@ class Farthest(Suite):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run jumps to ever farther goals until success is below GIVEN_UP, plot them, and return the metrics."""
-        env, bins = run.env(self.num_jumps), {}
+        env = run.env(self.num_jumps)
+        bins = {}
         for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
             middle = round(self.min_distance + number * BIN, 6)
             bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")

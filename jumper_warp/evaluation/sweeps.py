@@ -201,7 +201,8 @@ class DistanceSweep(Sweep):
 
     def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of `jumper evaluate`, and the success rate over the distances of the paper's training."""
-        inside, success = within(log.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
+        inside = within(log.goals[..., 0], PAPER_TRAINED)
+        success = chosen(PLACE_METRICS, "success_rate")
         note = "over 0.4 to 1 m"
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 

@@ -50,10 +50,12 @@ class _GraphBuilder:
 
     def weight(self, layer: int, value: np.ndarray) -> str:
         """Add a layer's weight, (out, in), to the graph; two equal blocks on its diagonal are stored once."""
-        name, block = f"actor_{layer}_weight", _repeated_block(value)
+        name = f"actor_{layer}_weight"
+        block = _repeated_block(value)
         if block is None:
             return self.constant(name, value)
-        stored, columns = self.constant(f"actor_{layer}_block", block), block.shape[1]
+        stored = self.constant(f"actor_{layer}_block", block)
+        columns = block.shape[1]
         halves = []
         for half, pads in (("upper", (0, 0, 0, columns)), ("lower", (0, columns, 0, 0))):
             pads_name = self.constant(f"{name}_{half}_pads", pads, np.int64)

@@ -60,7 +60,8 @@ def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
     arrays = read_npz(path, "dump of a training")
     try:
         header = parse_json(str(arrays.pop("header")), "header")
-        names, entries = header["names"], [header["term"], header["task"]]
+        names = header["names"]
+        entries = [header["term"], header["task"]]
         entries += [name for group in GROUPS for name in names[group]]
         counts = [header["world"], header["step"], header["iteration"], header["config"]["train"]["seed"]]
         shapes = {"joint_q": 43, "joint_qd": 38, "action": 12} | {name: len(names[name]) for name in GROUPS}
@@ -69,7 +70,9 @@ def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
         valid &= all(values.dtype.kind in "biuf" for values in arrays.values())
         if not valid or any(arrays[name].shape != (size,) for name, size in shapes.items()):
             raise InputError(f"expected a {FORMAT} of version {VERSION}")
-        value, world, step = float(header["value"]), header["world"], header["step"]
+        value = float(header["value"])
+        world = header["world"]
+        step = header["step"]
         return NonFiniteValue(header["term"], value, world, step, arrays, names), header
     except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error})") from error

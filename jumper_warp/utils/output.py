@@ -53,7 +53,8 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder, repeat = Path("outputs", name, stamp), 1
+    folder = Path("outputs", name, stamp)
+    repeat = 1
     while True:
         try:
             folder.mkdir(parents=True)

@@ -56,7 +56,8 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         # prints to another file than the terminal must not be redirected to it
         progress = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
         progress.start()
-    _shown, task = progress, progress.add_task(title, total=total)
+    _shown = progress
+    task = progress.add_task(title, total=total)
     try:
         yield partial(progress.advance, task)
     finally:

@@ -29,7 +29,8 @@ def module_from_file(name: str, path: str | Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ImportError(f"{Path(path).name}: the name of a module's file must end in .py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name], folder = module, str(Path(path).resolve().parent)
+    sys.modules[name] = module
+    folder = str(Path(path).resolve().parent)
     sys.path.insert(0, folder)
     try:
         spec.loader.exec_module(module)
@@ -50,7 +51,8 @@ def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
     folders = {os.path.dirname(file) for file in files if os.path.basename(os.path.dirname(file)) != "site-packages"}
     near = []
     for name, module in list(sys.modules.items()):
-        file, path = getattr(module, "__file__", None), name.replace(".", os.sep)
+        file = getattr(module, "__file__", None)
+        path = name.replace(".", os.sep)
         if file not in files and any(file in (f"{f}/{path}.py", f"{f}/{path}/__init__.py") for f in folders):
             near.append(module)
     return [*modules, *near]

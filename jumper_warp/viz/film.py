@@ -60,7 +60,8 @@ def write_film(
     right, at the least distance that shows all). ranks: indices in `recording.worlds`, shown side by side (default:
     all). Raises InputError: see `check_film`, or too many frames for the format; OSError.
     """
-    path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    path = Path(path)
+    size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
     check_film(path, size, fps, speed, eye)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
@@ -101,13 +102,15 @@ def _images(
 ) -> Iterator[Image.Image]:  # fmt: skip
     """Yield the annotated images of a film at `times` [s], with a progress bar; name: label of the bar."""
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
-    poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
+    poses = drawn_poses(recording, times)
+    paths = body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
     seen = paths - targets[:, None]
     if len(recording.commands) or not recording.contact_forces.any():  # arrows; raised legs of a floating robot
         seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
     frame_view = _view(seen, size, eye)
-    targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
+    targets = _interpolated(recording, targets, times)
+    bases = _interpolated(recording, paths, times)
     with (
         open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer,
         phase(f"drawing {name} with {renderer.name}", len(times)) as advance,
@@ -143,7 +146,8 @@ def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
     before = np.maximum(after - 1, 0)
     span = np.maximum(recording.times[after] - recording.times[before], 1.0e-9)
     weight = np.clip((times - recording.times[before]) / span, 0.0, 1.0)[:, None, None]
-    start, end = recording.poses[before].astype(float), recording.poses[after].astype(float)
+    start = recording.poses[before].astype(float)
+    end = recording.poses[after].astype(float)
     sign = np.where((start[..., 3:] * end[..., 3:]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
     end[..., 3:] *= sign
     poses = start + weight * (end - start)
@@ -211,7 +215,8 @@ def _encode_mp4(
 
 def _encoded_animation(images: Iterator[Image.Image], kind: str, fps: float, count: int) -> bytes:
     """Return `count` images as the content of a file with a repeating animation; kind: webp or gif."""
-    pictures, data = list(images), io.BytesIO()
+    pictures = list(images)
+    data = io.BytesIO()
     tick = 10 if kind == "gif" else 1  # [ms] unit of the durations in the file
     ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)
     durations = np.diff(ends).tolist()  # [ms]

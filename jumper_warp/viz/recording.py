@@ -187,7 +187,8 @@ def _check_arrays(recording: Recording) -> None:
 
 def _check_names(recording: Recording) -> None:
     """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies."""
-    worlds, frames = recording.worlds, len(recording.times)
+    worlds = recording.worlds
+    frames = len(recording.times)
     _check("worlds", worlds and all(type(world) is int and world >= 0 for world in worlds))
     _check("worlds", len(set(worlds)) == len(worlds))
     _check("bodies", all(re.fullmatch(r"world_\d+/.+", body) for body in recording.bodies))
