@@ -12,10 +12,10 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import scipy.stats
 
 from jumper_warp.evaluation.attitude import TURN_METRICS
@@ -230,19 +230,18 @@ def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
     Rates are compared by the two-proportion test with pooled variance, means by Welch's t-test, whose standard errors
     follow from the 95 % intervals.
     """
-    (p, n), (q, m) = ((float(x.value), int(x.trials or 0)) for x in (a, b))  # pyright: ignore[reportArgumentType]
+    counts = [int(x.trials or 0) for x in (a, b)]
+    values = [float(x.value) for x in (a, b)]  # pyright: ignore[reportArgumentType]
     if key.endswith("_rate"):
-        pooled = (p * n + q * m) / (n + m)
-        v = pooled * (1.0 - pooled) / n
-        w = pooled * (1.0 - pooled) / m
-        survival = scipy.stats.norm.sf
-    else:
-        v, w = (((x.interval[1] - x.interval[0]) / (2.0 * Z)) ** 2 if x.interval else 0.0 for x in (a, b))
-        freedom = (v + w) ** 2 / max(v**2 / (n - 1) + w**2 / (m - 1), 1.0e-300)
-        survival = partial(scipy.stats.t.sf, df=freedom)
-    if v + w == 0.0:
-        return 1.0 if p == q else 0.0
-    return 2.0 * float(survival(abs(p - q) / math.sqrt(v + w)))
+        table = [[value * n, (1.0 - value) * n] for value, n in zip(values, counts, strict=True)]
+        if 0.0 in np.sum(table, axis=0):  # all true or all false
+            return 1.0
+        return float(scipy.stats.chi2_contingency(table, correction=False).pvalue)
+    stds = [math.sqrt(n) * np.ptp(x.interval or 0.0) / (2.0 * Z) for x, n in zip((a, b), counts, strict=True)]
+    if not any(stds):
+        return 1.0 if values[0] == values[1] else 0.0
+    samples = [x for sample in zip(values, stds, counts, strict=True) for x in sample]
+    return float(scipy.stats.ttest_ind_from_stats(*samples, equal_var=False).pvalue)
 
 
 def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:

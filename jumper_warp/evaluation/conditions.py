@@ -63,7 +63,7 @@ class Conditions:
                 raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
         if self.gravity is not None:
             check_gravity(self.gravity)
-        self._with_fixed_parameters(RandomizationCfg.off())  # raises if a value is out of range
+        RandomizationCfg.off().with_fixed(**self.fixed_parameters)  # raises if a value is out of range
         if self.push_in_flight and not self.randomize:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
 
@@ -75,8 +75,12 @@ class Conditions:
     @property
     def fixed_parameters(self) -> dict[str, Any]:
         """Robot parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
-        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
-                  "sensor_offset": self.sensor_offset}  # fmt: skip
+        values = {
+            "latency": self.latency,
+            "gains": self.gain_scale,
+            "friction": self.friction,
+            "sensor_offset": self.sensor_offset,
+        }
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, trained: RobotOverlay | None) -> RobotOverlay | None:
@@ -98,10 +102,6 @@ class Conditions:
         """Whether the environment sets robot parameters at resets, to sampled or fixed values."""
         return self.randomize or bool(self.fixed_parameters)
 
-    def _with_fixed_parameters(self, ranges: RandomizationCfg) -> RandomizationCfg:
-        """Return a copy of randomisation ranges, in which each of `fixed_parameters` is constant."""
-        return ranges.with_fixed(**self.fixed_parameters)
-
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a copy of a task with these conditions' gravity, randomisation and events, and collision margins 0 m.
 
@@ -111,12 +111,12 @@ class Conditions:
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
-            randomization = replace(self._with_fixed_parameters(trained.in_tests()), push_in_flight=in_flight)
+            randomization = replace(trained.in_tests().with_fixed(**self.fixed_parameters), push_in_flight=in_flight)
             return replace(task, randomization=randomization)
         if not self.fixed_parameters:
             return task
         nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
-        return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
+        return replace(task, randomization=nominal.with_fixed(**self.fixed_parameters), events=()).on_level_ground()
 
 
 def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditions) -> RobotOverlay | None:

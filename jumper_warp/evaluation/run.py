@@ -155,7 +155,10 @@ class Run(ABC):
         values |= {} if conditions.sensor_offset is None else {"sensor_offset_deg": conditions.sensor_offset}
         values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
-            values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)
+            steps = np.concatenate(self._latency)
+            values |= {} if conditions.latency is None else {"latency_requested_ms": conditions.latency}
+            values["latency_ms"] = 1000.0 * self._physics_dt * float(np.mean(steps))
+            values["latency"] = latency_text(steps, self._physics_dt)
         return values
 
     def note_robot(self, env: Env) -> None:
@@ -313,17 +316,6 @@ def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:
         for name, values in log.columns().items()
     }
     write_npz(folder / ("trials.npz" if number == 1 else f"trials_{number}.npz"), **columns)
-
-
-def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
-    """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_requested_ms`.
-
-    steps: latency of all worlds [physics steps], (num_envs,); physics_dt: physics step [s]; requested [ms]: value of
-    the flag `--latency`; None: omit `latency_requested_ms`.
-    """
-    values: dict[str, Any] = {} if requested is None else {"latency_requested_ms": requested}
-    mean = 1000.0 * physics_dt * float(np.mean(steps))
-    return values | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
 
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:

@@ -7,7 +7,7 @@ import functools
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
@@ -39,23 +39,24 @@ def in_float32(value: float) -> str:
 
 def check_finite(name: str, *values: float) -> None:
     """Raise InputError if a value is NaN or infinite in float32."""
-    for value in values:
-        if not abs(value) <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite, got {in_float32(value)}")
+    _check_range(name, values, -FLOAT32_MAX, "finite")
 
 
 def check_positive(name: str, *values: float) -> None:
     """Raise InputError unless all values are positive and finite in float32."""
-    for value in values:
-        if not FLOAT32_MIN <= value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be positive and finite, got {in_float32(value)}")
+    _check_range(name, values, FLOAT32_MIN, "positive and finite")
 
 
 def check_not_negative(name: str, *values: float) -> None:
     """Raise InputError unless all values are non-negative and finite in float32."""
+    _check_range(name, values, 0.0, "finite and not negative")
+
+
+def _check_range(name: str, values: Iterable[float], low: float, expected: str) -> None:
+    """Raise InputError, which names the `expected` property, unless all values are from `low` to FLOAT32_MAX."""
     for value in values:
-        if not 0.0 <= value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite and not negative, got {in_float32(value)}")
+        if not low <= value <= FLOAT32_MAX:
+            raise InputError(f"{name} must be {expected}, got {in_float32(value)}")
 
 
 def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:
@@ -77,13 +78,17 @@ def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> int:
 
     Raises InputError: it is a bool, no integer, or not in 1 to `most`.
     """
-    try:
-        number = 0 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = 0
-    if not 1 <= number <= most:
+    if (number := _integer(value)) is None or not 1 <= number <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
     return number
+
+
+def _integer(value: Any) -> int | None:
+    """Return an integer of any type as int; None: it is a bool or no integer."""
+    try:
+        return None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        return None
 
 
 def check_flags(**flags: Any) -> None:
@@ -169,11 +174,7 @@ def check_seed(value: Any) -> int:
 
     Raises InputError: it is a bool, no integer, or not in 0 to MOST_SEED.
     """
-    try:
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = -1
-    if not 0 <= number <= MOST_SEED:
+    if (number := _integer(value)) is None or not 0 <= number <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
     return number
 

@@ -73,10 +73,8 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
         status = os.stat(path)
     except FileNotFoundError:
         raise error(f"{path}: no such file ({purpose})") from None
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
-    except ValueError:  # a null character
-        raise error(f"{path!s:.200}: is not a file name ({purpose})") from None
+    except (OSError, ValueError) as problem:  # ValueError: a null character
+        raise error(f"{path!s:.200}: cannot be read: {problem} ({purpose})") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder, not a file" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise error(f"{path}: {kind} ({purpose})")
@@ -87,15 +85,7 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
 
 def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
     """Return the bytes of a regular file; arguments and errors are those of `existing_file`."""
-    path = existing_file(path, purpose, limit, error)
-    try:
-        with path.open("rb") as file:
-            data = file.read(limit + 1)
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
-    if len(data) > limit:  # it has grown, or its size is unknown as in /proc
-        raise error(f"{path}: larger than {limit >> 20} MiB ({purpose})")
-    return data
+    return existing_file(path, purpose, limit, error).read_bytes()
 
 
 def read_json(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial, wraps
-from typing import ParamSpec, TypeVar
+from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
@@ -16,8 +14,6 @@ from rich.text import Text
 
 from jumper_warp.utils.startup import open_standard_streams
 
-P = ParamSpec("P")
-T = TypeVar("T")
 _shown: Progress | None = None  # Display of the outermost phase, which shows the phases within it too
 
 
@@ -65,16 +61,3 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         _shown = outer
         if outer is None:
             progress.stop()
-
-
-def shown(title: str, function: Callable[P, T]) -> Callable[P, T]:
-    """Return a version of a function that displays `title` while it runs in the main thread outside a `phase`."""
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if _shown is not None or threading.current_thread() is not threading.main_thread():
-            return function(*args, **kwargs)
-        with phase(title):
-            return function(*args, **kwargs)
-
-    return call

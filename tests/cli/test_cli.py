@@ -20,7 +20,6 @@ from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, La
 from jumper_warp.policies.policy import Policy, load_policy, save_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy
@@ -93,35 +92,6 @@ def test_flag_of_a_duration_may_be_infinite_for_never(capsys):
     assert run(capsys, "train", "vertical-jump", *flags.split())[2][-1] == "jumper: /none: no such folder (policy)"
 
 
-@pytest.mark.parametrize(
-    ("args", "place"),
-    [
-        (["train", "vertical-jump", "--resume", ""], "after --resume"),
-        (["train", "vertical-jump", "--init-policy="], "of --init-policy"),
-        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "after --log-root"),
-        (["train", ""], "after train"),
-        (["evaluate", "vertical_jump", "--out", ""], "after --out"),
-        (["evaluate", ""], "after evaluate"),
-        (["play", "--script", ""], "after --script"),
-        (["export", "vertical_jump", "--out="], "of --out"),
-        (["sysid", "fit", ""], "after fit"),
-        (["list", "--task-module", ""], "after --task-module"),
-    ],
-    ids=str,
-)
-def test_refuses_empty_values(capsys, tmp_path, monkeypatch, args, place):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = run(capsys, *args)
-    assert (code, out, len(err)) == (2, "", 1) and not list(tmp_path.iterdir())
-    assert err == [f"jumper: empty value {place}"]
-
-
-def test_train_without_task_lists_tasks_and_exits_with_2(capsys):
-    code, out, err = run(capsys, "train")
-    assert (code, out, len(err)) == (2, "", 1) and "jumper train TASK [flags]" in err[0]
-    assert all(name in err[0] for name in TASKS)
-
-
 def test_input_error_prints_one_line(capsys, monkeypatch):
     def raise_input_error(*_):
         raise InputError("expected a,\n  got b")
@@ -189,12 +159,6 @@ def test_flag_exists_for_each_setting_outside_terms(name):
         else:
             args += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
     assert parsed(task, args) == task and len(settings) > 40
-
-
-def test_task_fields_without_flags_hold_functions_or_names():
-    flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
-    names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])
@@ -398,14 +362,6 @@ def test_viewer_binds_to_loopback(tmp_path):
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
-def test_viewer_runs_no_code_of_the_working_directory(tmp_path):
-    (tmp_path / "rerun.py").write_text("raise SystemExit('code of the working directory')\n")
-    command = viewer_command(tmp_path / "jump.rrd")
-    version = [*command[: command.index("rerun") + 1], "--version"]
-    done = subprocess.run(version, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and "rerun" in done.stdout and "working directory" not in done.stderr
-
-
 def redirected(redirection, *args, **environment):
     """Return the finished process of a command whose streams a shell has redirected."""
     command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", *args]
@@ -416,17 +372,6 @@ def redirected(redirection, *args, **environment):
 def test_closed_streams_exit_with_0(redirection):
     done = redirected(redirection, "list")
     assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("args", [["list"], ["train", "vertical-jump", "--help"]], ids=" ".join)
-def test_full_disk_under_the_output_is_one_line(args):
-    done = redirected(">/dev/full", *args)
-    assert (done.returncode, done.stderr) == (2, "jumper: standard output: No space left on device\n")
-
-
-def test_characters_that_the_terminal_lacks_are_printed_as_escapes():
-    done = redirected("", "train", "vertical-jump", "--help-all", PYTHONIOENCODING="ascii")
-    assert done.returncode == 0 and r"\u03bb of generalised advantage" in done.stdout
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])

@@ -10,7 +10,7 @@ import scipy.stats
 
 from experiments import measure_policies
 from experiments.measure_policies import payload_overlay, run_test, with_trials
-from experiments.policy_tables import TABLES, difference_p, filled, main_table, pages, seed_section, seed_tests
+from experiments.policy_tables import difference_p, filled, main_table, pages, seed_section, seed_tests
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
@@ -18,9 +18,9 @@ from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.metrics import MetricValue, mean, rate
-from jumper_warp.utils.output import read_report
+from metric_helpers import saved_metrics
 from support import policy_results
-from support.policy_results import COMBINED, CONDITIONS, PAGES, TESTS, Row, saved_rows, tasks_of, undefined
+from support.policy_results import CONDITIONS, TESTS, Row, saved_rows, tasks_of, undefined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -56,20 +56,7 @@ def test_evaluations_have_at_least_the_requested_trials(policy, count):
     assert flags.log(run.evaluation.prepare_task(run.task), 0).count == count
 
 
-def jump_task():
-    """Return the task of a jump with the terminations of its evaluation."""
-    run = EvaluationRun("vertical_jump")
-    return run.evaluation.prepare_task(run.task)
-
-
 # ---------------------------------------------------------------- two seeds
-
-
-def test_p_of_rates_is_that_of_the_chi_square_test():
-    a, b = (rate(np.arange(n) < k) for k, n in ((510, 1000), (600, 1100)))
-    table = [[510, 490], [600, 500]]
-    assert difference_p("x_rate", a, b) == pytest.approx(scipy.stats.chi2_contingency(table, correction=False).pvalue)
-    assert difference_p("x_rate", rate(np.ones(50)), rate(np.ones(60))) == 1.0
 
 
 def test_p_of_means_is_that_of_welchs_test_of_the_trials():
@@ -134,13 +121,6 @@ def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):
     assert values["randomised"] == f"{row.metrics['apex_error_abs_mean_m'].value:.4f}"
 
 
-def test_every_test_has_its_place_in_a_table_and_names_known_policies():
-    shown = {name for table in TABLES.values() for name in table["tests"]}
-    chosen = {name for need in PAGES["needs"] for name in need.get("tests", ())}
-    assert set(TESTS) <= shown | chosen
-    assert {policy for test in TESTS.values() for policy in test["policies"]} <= {*policy_tasks(), COMBINED}
-
-
 def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr(measure_policies.subprocess, "run", lambda command, **_: calls.append(command))
@@ -177,7 +157,7 @@ def test_rows_have_the_metrics_of_jumper_evaluate(measured, tmp_path):
     flags = ["--num-jumps", "16", "--randomize", "--noise", "--push-in-flight", "--device", "cpu"]
     assert jumper(["evaluate", "vertical_jump", *flags, "--out", str(tmp_path)]) in (0, None)
     row_folder = measured[0].out / "vertical_jump/push_in_flight-0"
-    assert read_report(row_folder).metrics == read_report(tmp_path).metrics
+    assert saved_metrics(row_folder) == saved_metrics(tmp_path)
 
 
 def test_policies_get_new_rows_and_keep_their_other_rows_and_earlier_metrics(measured, tmp_path, monkeypatch):
