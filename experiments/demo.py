@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import open_loop_jump
 from jumper_warp.evaluation.conditions import Conditions
@@ -20,6 +19,7 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.film import write_film
 from support.scripts import DeviceArgs, announce, prepare, report, run_script
 
@@ -52,7 +52,7 @@ def film_jump(args: Args, folder: Path) -> JumpLog:
     return log
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Simulate open-loop jump, paper's tests and filmed jump, print one summary, and return the metrics."""
     folder = prepare("demo", args)
     values = {}

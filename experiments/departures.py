@@ -41,7 +41,7 @@ from jumper_warp.rl.run_names import newest
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
@@ -191,7 +191,7 @@ COLUMNS = {
 }  # fmt: skip
 """Columns of the table: metric and scale; cells are nominal / randomised."""
 WIDTH = 180  # Width of the table in characters
-MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]  # Metrics by training (name, seed), test and name
+MetricsByTraining = dict[tuple[str, int], dict[str, Json]]  # Metrics by training (name, seed), test and name
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class DepartureCfg:
     """Settings with which the ablations of a task are trained and evaluated."""
 
     iterations: int  # Iterations of each training
-    goals: dict[str, Any]  # [m] Flags that set the goals of the evaluated jumps
+    goals: Json  # [m] Flags that set the goals of the evaluated jumps
     squats: tuple[float, float]  # [m] Range of goals for which squats are held
     begin: str = ""  # Further flags of `jumper train` for every training
 
@@ -241,7 +241,7 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     return result.folder / name.format(result.iteration)
 
 
-def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
+def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, Json]:
     """Evaluate a policy's jumps and held squats: return the scalar metrics by name, for each of TESTS.
 
     args: `Args`; folder: for outputs of the run.
@@ -278,7 +278,7 @@ def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
     plot_results(results, folder / "departures.png")
 
 
-def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
+def cell(tests: dict[str, Json], name: str, scale: float) -> str:
     """Format a metric of nominal and randomised jumps for the table, as `nominal / randomized`, times `scale`.
 
     tests: metrics by test and name.
@@ -346,13 +346,13 @@ class Args(ThreadArgs):
         return [self.task, *shlex.split(flags), "--log-root", str(folder)]
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Train and evaluate each ablation of a jump task, write results as a table and a plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder = prepare("departures", args, args.threads)
     results = {}
-    values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
+    values: Json = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
     for name, seed, ablation in tracked([*args.trainings()], "trainings"):
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 from jumper_warp.utils.rotations import yaw_of
 from jumper_warp.viz.plots import figure
@@ -82,7 +83,7 @@ class FlightLog(EvaluationLog):
         self._yaw = np.zeros(n)
         self._initial_momentum = np.zeros((n, 3))
 
-    def begin(self, env: Any) -> None:
+    def begin(self, env: Env) -> None:
         """Reset every robot to the default pose, with its commanded apex height."""
         self.step_dt = env.step_dt
         goals = np.zeros((len(self.apex), 3))
@@ -120,7 +121,7 @@ class FlightLog(EvaluationLog):
         action[pushing] = legs.reshape(n, 12)[pushing]
         return action
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the robots' motion, contacts and termination by name for `update`, (num_envs, ...), world axes.
 
         base_pos [m], tilt [rad], turn (size of the yaw [rad]), rise (upward speed [m/s]), spin (angular speed [rad/s]),
@@ -135,7 +136,7 @@ class FlightLog(EvaluationLog):
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
                 "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
-    def record_step(self, env: Any) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Record a policy step; return whether all flights have ended.
 
         If `turns`, request the turning skill for robots that took off in this step.
@@ -208,7 +209,7 @@ class FlightLog(EvaluationLog):
         """Return the last tilt [deg] and base height [m] of all worlds."""
         return {"tilt/of {} [deg]": np.degrees(self.tilts[-1]), "height/base of {} [m]": self.heights[-1]}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return commanded apex heights `asked_m` of some worlds, and `late_ms`, the delays of front and left legs."""
         notes = {"asked_m": self.apex[list(worlds)].tolist()}
         return notes if self.late is None else notes | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}

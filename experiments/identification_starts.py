@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from jumper_warp.identification.recording import KINDS, measure, replay_plan, sa
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.results import CONFIDENCE, Identification
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
@@ -86,7 +86,7 @@ def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Ge
     return float(1.0 - is_good(np.abs(errors / result.std)[:, result.identified]).mean())
 
 
-def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]:
+def identify_far_robot(stream: Stream, robot: int, noise: int) -> Json:
     """Sample a robot, record its motions, identify it on one CPU thread, and return the result as JSON data.
 
     robot, noise: indices of the robot with its motions, and of the noise of its sensors and scale.
@@ -152,7 +152,7 @@ class Args(OutputArgs):
             raise InputError(f"shard must be K/N with K in 1 to N, such as 2/3, got {self.shard:.20}")
 
 
-def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
+def saved_fits(path: Path) -> dict[tuple[int, int], Json]:
     """Return the fits in a file of JSON lines by (index of robot, index of noise); a last line cut short is dropped."""
     fits = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
@@ -164,7 +164,7 @@ def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
     return fits
 
 
-def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(fits: list[Json]) -> Json:
     """Return metrics of all fits: numbers of accepted (consistent) and good ones, interval coverage, and CPU time."""
     accepted, good = ([fit for fit in fits if fit[name]] for name in ("consistent", "good"))
     bad = [fit for fit in accepted if not fit["good"]]
@@ -191,7 +191,7 @@ def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Compute the fits that are missing in the output folder, and write and return the metrics of all fits."""
     folder = output_dir("identification_starts", args.out)
     path = folder / f"{args.stream}.jsonl"

@@ -25,6 +25,7 @@ from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
 from support.scripts import DeviceArgs, prepare, report, run_script
@@ -110,7 +111,7 @@ class Args(DeviceArgs):
 def main(args: Args) -> dict:
     """Simulate a jump for each spring stiffness and squat angle, plot the best apexes, and return the metrics."""
     folder = prepare("leg_springs", args)
-    values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
+    values: Json = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     title = f"Open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"

@@ -35,6 +35,7 @@ from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import read_values
 from support.policy_results import (
     COMBINED,
@@ -145,7 +146,7 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
     return [row for row in defined if not (args.row(*row) / METRICS).is_file()]
 
 
-def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str, Any]:
+def measure_row(args: Args, policy: str, condition: str, seed: int) -> Json:
     """Evaluate a policy in one condition, write its metrics.json, and return conditions and metrics by name."""
     if condition in TESTS:
         flags = ["--seed", str(seed), *(["--device", args.device] if args.device else [])]

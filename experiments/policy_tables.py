@@ -24,13 +24,13 @@ from jumper_warp.evaluation.velocities import VELOCITY_METRICS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.metrics import MetricValue, Z, unit_of
 from support.policy_results import CONDITIONS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
 from support.scripts import run_script
 
 BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. ]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-TABLES: dict[str, dict[str, Any]] = PAGES["tables"]  # Tables of tests by name
+TABLES: dict[str, Json] = PAGES["tables"]  # Tables of tests by name
 SHOWN = {"nominal": "nominal", "randomised": "randomised", "mujoco": "SolverMuJoCo", "friction_0.4": "friction 0.4"}
 """Conditions in a policy's main table, and their titles there."""
 SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
@@ -236,7 +236,8 @@ def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
         table = [[value * n, (1.0 - value) * n] for value, n in zip(values, counts, strict=True)]
         if 0.0 in np.sum(table, axis=0):  # all true or all false
             return 1.0
-        return float(scipy.stats.chi2_contingency(table, correction=False).pvalue)
+        _, p, *_ = scipy.stats.chi2_contingency(table, correction=False)
+        return float(p)  # pyright: ignore[reportArgumentType]
     stds = [math.sqrt(n) * np.ptp(x.interval or 0.0) / (2.0 * Z) for x, n in zip((a, b), counts, strict=True)]
     if not any(stds):
         return 1.0 if values[0] == values[1] else 0.0

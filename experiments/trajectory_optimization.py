@@ -54,6 +54,7 @@ from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
 from jumper_warp.utils.arrays import write_npz
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
@@ -73,7 +74,7 @@ class MotionReplay:
     all motors) [W], angle (n, 12) [rad], torque (n, 12) [N m]. `_evaluate` documents the results.
     """
 
-    def __init__(self, targets: np.ndarray, problem: Problem, *, notes: dict[str, Any] | None = None) -> None:
+    def __init__(self, targets: np.ndarray, problem: Problem, *, notes: Json | None = None) -> None:
         """Simulate motor targets [rad], (policy steps, 12), from standing, with the robot and ground of a problem.
 
         notes: JSON metadata of the recording.
@@ -188,7 +189,7 @@ class MotionReplay:
         constraints = self.problem.values(self.motion).constraints
         return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Json:
         """Return the metrics of the jump, with units at the end of the names; `collisions`: bit flags of contacts."""
         return {
             "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
@@ -313,9 +314,15 @@ def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
 
 
 def _far(
-    lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
-    command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
-) -> Problem:  # fmt: skip
+    lean: float = 0.0,
+    *,
+    torque: float = 18.0,
+    speed: float = 1.0,
+    pitch: float = PITCH,
+    away: float = AWAY,
+    command_filter: Callable[[], FilterCfg] = horizontal_jump_filter,
+    **settings: Any,
+) -> Problem:
     """Return the optimisation problem of the farthest flight.
 
     lean [1]: weight of leaning back before it, up to BACK; torque [N m] and speed [1]: as for `motors_of`; pitch [rad],
@@ -337,15 +344,13 @@ LANDING = Knots((*UP.at, 48.0, 52.0, *map(float, range(54, 74, 2)), 80.0, 90.0, 
 """Knots of vertical jumps, continued to a second after touchdown."""
 
 
-def _vertical(
-    objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any
-) -> Problem:  # fmt: skip
+def _vertical(objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any) -> Problem:
     """Return the optimisation problem of a vertical jump; more: additional constraints; torque [N m]: limit."""
     constraints = (jumps.clear(), jumps.upright(TILT, at_end=False), jumps.drifts(DRIFT), *more)
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
 
-FINE: dict[str, Any] = {"substeps": SUBSTEPS}  # Arguments of `Problem`: physics steps per policy step
+FINE: Json = {"substeps": SUBSTEPS}  # Arguments of `Problem`: physics steps per policy step
 COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
 QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
@@ -353,9 +358,9 @@ UPWARD = (
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
-CALM: dict[str, Any] = {"slack": 0.03, "check_every": 5, "return_scale": 0.7}
+CALM: Json = {"slack": 0.03, "check_every": 5, "return_scale": 0.7}
 """Settings of stages that often return to the best motion and continue with smaller steps."""
-CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
+CALMEST: Json = CALM | {"slack": 0.02}
 FORWARD = (
     (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
     (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
@@ -395,7 +400,7 @@ JUMPS = {
         lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",
     ),
 }  # fmt: skip
-LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
+LIMITS: dict[str, tuple[str, Json]] = {
     "torque_24_8": ("24.8 N m", {"torque": 24.8}), "speed": ("motor speeds × 1.5", {"speed": 1.5}),
     "friction_1_5": ("friction 1.5", {"friction": 1.5}), "friction_0_6": ("friction 0.6", {"friction": 0.6}),
     "pitch": ("any pitch at landing", {"pitch": FREE}), "stance": ("stance beyond 0.3 m", {"away": FREE}),
@@ -467,7 +472,7 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     jump = ALL_JUMPS[name]
     wall = time.perf_counter()
     cpu = time.process_time()
-    settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
+    settings: Json = {"device": args.device, "threads": args.threads}
     knots = jump.make(**FINE, **settings).knots
     rng = np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
@@ -483,13 +488,13 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     return values | {"value": jump.value(replay), "violation": replay.violation}, replay
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Optimise the jumps in order, write their replays, and return the metrics."""
     torch.set_num_threads(1)  # arrays of torch are small; the simulated worlds use the cores
     folder = prepare("trajectory_optimization", args, args.threads)
     best = {}
     replays: dict[str, MotionReplay] = {}
-    values: dict[str, Any] = {}
+    values: Json = {}
     for name in tracked(args.jumps, "optimising jumps"):
         row, replay = run_jump(name, args, folder, best)
         replays[ALL_JUMPS[name].label] = replay

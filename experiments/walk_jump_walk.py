@@ -103,7 +103,7 @@ def main(args: Args) -> dict:
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun(SkillNames(args.policy, args.jump_up, args.jump_to)).prepare_from(name, args)
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))
-    course.warn_beyond_training(run.skills.tasks)
+    course.warn_beyond_training(run.tasks)
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
     paper = {} if args.course else {f"settled_{key}": value for key, value in VelocityEvaluation.published.items()}

@@ -19,7 +19,6 @@ that the policy was not trained on.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class GaitRecorder:
     Lists have one array per sampled policy step; paws FL, FR, BL, BR.
     """
 
-    env: Any  # The sampled `jumper_warp.envs.env.Env`
+    env: Env  # The sampled `jumper_warp.envs.env.Env`
     skip: float = 2.0  # [s] Time at the start that is not sampled
     contact: list[np.ndarray] = field(default_factory=list)  # (robots, 4) Whether each paw is on the ground
     paw_height: list[np.ndarray] = field(default_factory=list)  # [m] (robots, 4) Height of paws above the ground
@@ -53,7 +52,7 @@ class GaitRecorder:
     speed: list[np.ndarray] = field(default_factory=list)  # [m/s] (robots,) Horizontal speed of the base
     steps: int = 0  # Number of policy steps so far, skipped ones included
 
-    def __call__(self, *_: Any) -> None:
+    def __call__(self, *_: object) -> None:
         """Append a sample of the gait, unless within `skip` of the start."""
         self.steps += 1
         if self.steps <= round(self.skip / self.env.step_dt):
@@ -86,9 +85,15 @@ class GaitRecorder:
 
 
 def gait_metrics(
-    contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
-    speed: np.ndarray, weight: np.ndarray, step_dt: float,
-) -> Metrics:  # fmt: skip
+    contact: np.ndarray,
+    paw_height: np.ndarray,
+    force: np.ndarray,
+    torque: np.ndarray,
+    power: np.ndarray,
+    speed: np.ndarray,
+    weight: np.ndarray,
+    step_dt: float,
+) -> Metrics:
     """Compute step frequency, swing height, contact patterns, torques and cost of transport of walks.
 
     The arrays are the lists of `GaitRecorder`, (steps, robots, ...).

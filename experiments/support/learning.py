@@ -22,6 +22,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import Learner
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
 from support.timing import process_age
 
@@ -88,9 +89,14 @@ def warm_up(env: VecEnv, trainer: Learner) -> None:
 
 
 def train_and_evaluate(
-    env: VecEnv, trainer: Learner, eval_env: Env, length: float, every: float,
-    limits: tuple[float, float] | None = None, by_iterations: bool = False,
-) -> LearningCurve:  # fmt: skip
+    env: VecEnv,
+    trainer: Learner,
+    eval_env: Env,
+    length: float,
+    every: float,
+    limits: tuple[float, float] | None = None,
+    by_iterations: bool = False,
+) -> LearningCurve:
     """Train for a time or a number of iterations, evaluate at intervals, and return the learning curve.
 
     Schedules follow `length`, as in `jumper train --max-seconds` or `--max-iterations`. Compilation (`warm_up`)
@@ -142,12 +148,12 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     return curve
 
 
-def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
+def curve_metrics(curve: LearningCurve, name: str) -> Json:
     """Return final success, and time and steps to reach each of RATES, of one training's learning curve.
 
     Keys: `<metric>_<name>`.
     """
-    values: dict[str, Any] = {f"success_{name}": curve.success[-1]}
+    values: Json = {f"success_{name}": curve.success[-1]}
     values |= {f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class SquatLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return paw forces, motor torques and termination of the robots by name, for `update`.
 
         `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,).

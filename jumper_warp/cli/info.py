@@ -15,6 +15,7 @@ import tyro
 
 from jumper_warp.cli.list import describe, size_text
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.tables import WIDTH
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     print(json.dumps(content, indent=2) if cfg.json else "\n".join(lines))
 
 
-def policy_info(policy: PolicySummary) -> tuple[dict[str, Any], list[str]]:
+def policy_info(policy: PolicySummary) -> tuple[Json, list[str]]:
     """Return the description of a policy as JSON data and as lines of text."""
     from jumper_warp.policies.catalog import PICTURE
     from jumper_warp.utils.assets import POLICIES, policy_tasks
@@ -144,7 +145,7 @@ def properties(values: Mapping[str, str]) -> list[str]:
     return [line.replace(UNBROKEN, " ") for line in lines]
 
 
-def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, Any], list[str]]:
+def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[Json, list[str]]:
     """Return the description of a task as JSON data and as lines of text.
 
     modules: loaded by --task-module, for the printed `jumper train` command.
@@ -180,7 +181,7 @@ def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, 
     return content, lines
 
 
-def contents_of(task: TaskCfg) -> dict[str, Any]:
+def contents_of(task: TaskCfg) -> Json:
     """Return a task's observation and action sizes, observations, reward weights and terminations as JSON data."""
     return {
         "observation_sizes": {

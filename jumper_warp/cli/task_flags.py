@@ -21,6 +21,7 @@ from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 NO_SOURCE = __package__
 """Module name of the dataclasses made here: tyro parses its source, which is fast since the file is empty."""
@@ -101,7 +102,7 @@ def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
     return Setting(kind, kind(*(flag.value for flag in flags.values())), about)
 
 
-def _members(group: Any) -> dict[str, Any]:
+def _members(group: Any) -> Json:
     """Return the values of a group of flags by name; group: an instance of a dataclass by `_group`."""
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
@@ -122,7 +123,7 @@ def with_flags(value: Any, flags: Any) -> Any:
     return tuple((parts | new).values()) if isinstance(value, tuple) else dataclasses.replace(value, **new)
 
 
-def _parts(value: Any) -> dict[str, Any]:
+def _parts(value: Any) -> Json:
     """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
     if isinstance(value, Term):
         return {**value.numbers, **value.options}

@@ -18,7 +18,7 @@ from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
-from jumper_warp.utils.files import parse_json
+from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
 
     task = recipe.task
     flags = flags_of(recipe.task)
-    made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
+    made: Json = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
     default = kind(recipe.train, solver=recipe.solver, randomize=recipe.randomize, noise=recipe.noise)
     about = f"Train a policy on {task.name}."

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class AttitudeLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(self.turns)
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the task's arrays and the base's angular velocity [rad/s] by name, for `update`.
 
         `Env.task_arrays`, and `base_ang_vel` (num_envs, 3), world axes.
@@ -133,7 +134,7 @@ class AttitudeLog(EvaluationLog):
         speed = np.nan_to_num(self.angular_speeds[-1])
         return {"error/angle to goal, {} [deg]": np.degrees(error), "spin/angular speed, {} [rad/s]": speed}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the commanded turns of some worlds, key `turns_xyzw`, quaternions."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import tyro
 
@@ -20,6 +20,7 @@ from jumper_warp.evaluation.skills import SkillNames
 from jumper_warp.policies.catalog import add_files, find_policy, is_run, run_folder
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import MetricValue
 from jumper_warp.utils.output import Report, write_metrics
 from jumper_warp.utils.summary import PrintFlags
@@ -51,7 +52,7 @@ class EvaluateCfg(Generic[Flags]):
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
 
 
-def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
+def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> Json:
     """Evaluate a policy, write `metrics.json`, print a summary, and return conditions and metrics by name.
 
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
@@ -205,7 +206,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
     course = CourseLog([script])
-    course.warn_beyond_training(run.skills.tasks)
+    course.warn_beyond_training(run.tasks)
     env = run.env(1, block=course.block)
     notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)
@@ -222,7 +223,7 @@ def play_script(cfg: ScriptCfg) -> Path:
 
 def show_recording(
     run: Run, report: Report, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a recording (.rrd, picture, film if requested), print a summary, and return the path of the .rrd file.
 
     It opens the viewer that `cfg` names. report: written metrics of the run. name: of the files and of a trial; count,

@@ -18,6 +18,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_flag_fields, check_seed
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.streams import purpose_seed
 
@@ -73,7 +74,7 @@ class Conditions:
         return purpose_seed(self.stream, self.seed)
 
     @property
-    def fixed_parameters(self) -> dict[str, Any]:
+    def fixed_parameters(self) -> Json:
         """Robot parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
         values = {
             "latency": self.latency,
@@ -90,7 +91,7 @@ class Conditions:
         """
         return trained if self.robot is None else load_overlay(self.robot)
 
-    def env_settings(self, trained: RobotOverlay | None) -> dict[str, Any]:
+    def env_settings(self, trained: RobotOverlay | None) -> Json:
         """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         fixed = fixed_ranges(**self.fixed_parameters)
@@ -140,9 +141,13 @@ def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditio
 
 
 def env_of_recipe(
-    recipe: Recipe, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    recipe: Recipe,
+    num_envs: int,
+    conditions: Conditions,
+    *,
+    change: Callable[[TaskCfg], TaskCfg] | None = None,
     **scene: Any,
-) -> Env:  # fmt: skip
+) -> Env:
     """Return the environment of a recipe's task in the given test conditions.
 
     It has no rewards, no critic observation, and events only if randomised.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -33,9 +33,15 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
+from jumper_warp.utils.kernels import records
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
+    from jumper_warp.sim.solver import SolverJumper
 
 SKILLS = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
 """Skill of each kind of command."""
@@ -117,7 +123,7 @@ class CourseLog(EvaluationLog):
             if (chosen := self.target_skill == skill).any():
                 warn_beyond_training(task, self.goal[chosen])
 
-    def begin(self, env: Any) -> None:
+    def begin(self, env: Env) -> None:
         """Reset every robot to the default pose at rest, and start its first command."""
         self.step_dt = env.step_dt
         first = np.where(self.target_skill[:, :1] == WALK, self.goal[:, 0], 0.0)
@@ -125,7 +131,7 @@ class CourseLog(EvaluationLog):
         env.evaluation_reset(self._command, self.headings)
         self._request_jumps(env, np.full(len(self.end), True))
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return by name what `update` records, (robots, ...): base, skill, termination, paw forces [N], jump state.
 
         Base position [m], quaternion (xyzw), velocity [m/s] and angular velocity [rad/s] are in world axes. `jump_`
@@ -142,11 +148,11 @@ class CourseLog(EvaluationLog):
         rows = np.arange(len(q))
         kind = self.target_skill[rows, self._at]
         for name in ("goal", "phase", "took_off", "touched_down"):
-            by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
+            by_skill = [records(env.skills[skill].states)[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays
 
-    def record_step(self, env: Any) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Record a policy step, then send each robot its next command if it is due; return whether all are done."""
         before = self.current.copy()
         previous = self._skill
@@ -173,14 +179,14 @@ class CourseLog(EvaluationLog):
             self._place_blocks(env)
         return ended
 
-    def _place_blocks(self, env: Any) -> None:
+    def _place_blocks(self, env: Env) -> None:
         """Move the block under the goal of every robot that begins to jump onto one."""
         begins = np.flatnonzero((self.onto_block & (self.switch_step == len(self.skills))).any(axis=1))
         if len(begins):
-            goals = env.skills[JUMP_TO].states.numpy()["goal"][begins, :2]
-            env.sim.solver.place_blocks(goals, begins.tolist())
+            goals = records(env.skills[JUMP_TO].states)["goal"][begins, :2]
+            cast("SolverJumper", env.sim.solver).place_blocks(goals, begins.tolist())
 
-    def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
+    def _request_jumps(self, env: Env, worlds: np.ndarray) -> None:
         """Request the jump from those robots in `worlds`, (robots,) bool, whose current command is a jump."""
         rows = np.arange(len(worlds))
         at = self._at
@@ -306,7 +312,7 @@ class CourseLog(EvaluationLog):
         goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
         return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the scripts of some robots, key `scripts`, lists of [kind, *values]."""
         return {"scripts": [[[step.kind, *step.values] for step in self.scripts[world]] for world in worlds]}
 

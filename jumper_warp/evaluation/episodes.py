@@ -13,6 +13,7 @@ import numpy as np
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.checks import FLOAT32_MAX
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ class EpisodeLog(EvaluationLog):
         commands = [command_text(self.task, self.commands[world]) for world in worlds]
         return [f"{title}, {command}" for title, command in zip(titles, commands, strict=True)]
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the commands of some worlds, key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +29,7 @@ from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import git_commit
 from jumper_warp.utils.streams import purpose_seed
@@ -164,7 +164,7 @@ def correct_aim(
 
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     """Reduce the errors of jumps by Gauss-Newton steps on the network's weights, in place; return errors by step.
 
     Returns one record before the steps and one per step.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from jumper_warp.kernels.jump.terminations import second_takeoff
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.terms import TerminationTerm
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
@@ -379,7 +380,7 @@ class JumpLog(EvaluationLog):
             return {"heights": self.goals[:, 0, 2]}
         return {"goals": np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: goals [m] of some worlds, heights as `targets_m`, places as `goals_m`."""
         goals = self.goals[list(worlds)]
         return {"targets_m": goals[:, 0, 2].tolist()} if self.to_heights else {"goals_m": goals[..., :2].tolist()}

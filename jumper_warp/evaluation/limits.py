@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
 from jumper_warp.utils.progress import phase
 
@@ -23,7 +24,7 @@ LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
 PUSH_PROBABILITY = "events.push.probability"
 
 
-def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
+def open_loop_limits(env: Env, initial_state: Json) -> np.ndarray:
     """Simulate the open-loop jump of each robot; return the largest base heights [m], (num_envs,), NaN if diverged.
 
     The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes.

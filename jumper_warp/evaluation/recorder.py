@@ -30,9 +30,15 @@ class EnvRecorder:
     """Recorder of some worlds of an environment; call the object after every policy step to add a frame."""
 
     def __init__(
-        self, env: Env, log: EvaluationLog, worlds: Sequence[int], *, ground: Any = "plane",
-        block: BlockCfg | None = None, notes: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        env: Env,
+        log: EvaluationLog,
+        worlds: Sequence[int],
+        *,
+        ground: Any = "plane",
+        block: BlockCfg | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
         """Prepare an empty recording of worlds (indices, at least one) of the environment.
 
         log: supplies series, states, commands, labels and goals; ground: as in `build_model`; block: the environment's

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -16,18 +16,22 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe, shared_robot
 from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
-from jumper_warp.evaluation.skills import SkillNames, SkillPolicies
+from jumper_warp.evaluation.skills import WALK, SkillNames
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
-from jumper_warp.tasks.jump.evaluation import PlaceEvaluation
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.overlay_ranges import range_words
+from jumper_warp.tasks.switching import skills_and_handovers
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.arrays import write_npz
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import Report, output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -70,7 +74,7 @@ class EvaluationArgs(Conditions, PrintFlags):
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the test conditions from an experiment's flags; randomised robots have observation noise."""
-    values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
+    values: Json = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
     values["noise"] = args.randomize
     return Conditions(**values)
 
@@ -93,7 +97,7 @@ class Run(ABC):
         # Name of the evaluation; what `report` prints
         self.name = ""
         self.print_flags = PrintFlags()
-        self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
+        self.settings: Json = {}  # Settings of task, robot and test, reported with the conditions
         self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -143,7 +147,7 @@ class Run(ABC):
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
-    def condition_values(self) -> dict[str, Any]:
+    def condition_values(self) -> Json:
         """Conditions of the evaluation by name, without unset ones; with the latencies of the episodes so far."""
         conditions = self.conditions
         values = {**self.settings}
@@ -172,9 +176,14 @@ class Run(ABC):
             self.settings["ranges"] = range_words(env.task, env.overlay)
 
     def run_episodes(
-        self, env: Env, log: Log, *, film: str = "", film_scene: Mapping[str, Any] | None = None,
+        self,
+        env: Env,
+        log: Log,
+        *,
+        film: str = "",
+        film_scene: Mapping[str, Any] | None = None,
         on_step: Callable[[Log], None] | None = None,
-    ) -> Log:  # fmt: skip
+    ) -> Log:
         """Run one episode per world with the commands of a log, and return the log.
 
         film: name of the recording and picture of `record` evenly spaced worlds; empty: none. film_scene: the
@@ -214,9 +223,7 @@ class Run(ABC):
         what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
         print_summary(report, what, keys, flags=self.print_flags, seconds=seconds, **settings)
 
-    def report(
-        self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
-    ) -> dict[str, Any]:  # fmt: skip
+    def report(self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES) -> Json:
         """Write all metrics to `metrics.json`, print those with the given keys, and return all values by name."""
         written = self.write(metrics)
         ends = [key for key in metrics if key.startswith("ended_by_")]
@@ -250,9 +257,12 @@ class EvaluationRun(Run):
 
     @classmethod
     def from_args(
-        cls, name: str, args: EvaluationArgs, kind: type[Evaluation] = PlaceEvaluation,
+        cls,
+        name: str,
+        args: EvaluationArgs,
+        kind: type[Evaluation] = PlaceEvaluation,
         modules: Iterable[ModuleType] = (),
-    ) -> EvaluationRun:  # fmt: skip
+    ) -> EvaluationRun:
         """Return a prepared evaluation of the policy `args.policy` with the flags of an experiment.
 
         name: of the output folder; kind: class of the task's evaluation, else PolicyError; modules: the user's task
@@ -269,9 +279,12 @@ class EvaluationRun(Run):
         return self.policy.act
 
     def env(
-        self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, conditions: Conditions | None = None,
+        self,
+        count: int,
+        change: Callable[[TaskCfg], TaskCfg] | None = None,
+        conditions: Conditions | None = None,
         **scene: Any,
-    ) -> Env:  # fmt: skip
+    ) -> Env:
         """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_recipe`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
@@ -288,23 +301,56 @@ class EvaluationRun(Run):
 
 
 class SkillRun(Run):
-    """Evaluation of three policies (walk, jump up, jump to) on one robot."""
+    """Evaluation of three policies (WALK, JUMP_UP, JUMP_TO) on one robot, which switches between them.
+
+    policies, recipes, tasks: of the skills. skills: tasks in the conditions of the last `env`.
+    """
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Load the policies; call `prepare` before any other method. Raises PolicyError or CheckpointError."""
+        """Load the policies; call `prepare` before any other method.
+
+        Raises PolicyError or CheckpointError: one cannot be used, or is for another kind of skill.
+        """
         super().__init__()
-        self.skills = SkillPolicies(names)
+        from jumper_warp.policies.policy import Policy
+
+        self.names = astuple(names or SkillNames())
+        self.policies = [Policy.load(name) for name in self.names]
+        self.recipes = [policy.recipe() for policy in self.policies]
+        self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
+        self.skills = self.tasks
+        for task, kind in zip(self.tasks, (VelocityEvaluation, HeightEvaluation, PlaceEvaluation), strict=True):
+            if not isinstance(task.evaluation, kind):
+                raise PolicyError(f"expected a policy of a task with a {kind.__name__}, got one of {task.name}")
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return a function that computes the actions of all skills, (skills, num_envs, 12), from the state of `env`.
 
         Its argument is ignored: every skill reads its own observation of `env`.
         """
-        return lambda obs: self.skills.act(env)
+        import torch
+
+        pairs = list(zip(self.policies, env.skills, strict=True))
+        return lambda obs: torch.stack([policy.act(skill.obs["actor"]) for policy, skill in pairs])
 
     def env(self, count: int, **scene: Any) -> Env:
-        """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, e.g. `block`."""
-        env = self.skills.env(count, self.conditions, **scene)
+        """Return an environment of `count` robots that start with WALK, and move the policies to its device.
+
+        The robot has the overlay (changed parameters) of the policies' training. scene: further arguments of `Env`,
+        e.g. `block`. Raises PolicyError: policies were trained with different overlays, or the tasks do not fit.
+        """
+        from jumper_warp.envs.env import Env
+
+        walk, *jumps = (self.conditions.applied(task) for task in self.tasks)
+        try:
+            self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
+        except InputError as error:
+            raise PolicyError(str(error)) from error
+        robots = {name: recipe.robot for name, recipe in zip(self.names, self.recipes, strict=True)}
+        settings = self.conditions.env_settings(shared_robot(robots, self.conditions))
+        env = Env(self.skills, count, skill=WALK, handovers=handovers, **settings, **scene)
+        for policy in self.policies:
+            policy.to(env.device)
         self.note_robot(env)
         return env
 

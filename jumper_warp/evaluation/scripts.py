@@ -13,7 +13,7 @@ from typing import Any
 
 from jumper_warp.evaluation.log import check
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json
+from jumper_warp.utils.files import Json, read_json
 
 KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
@@ -70,7 +70,7 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
     return tuple(steps)
 
 
-def _step(item: dict[str, Any]) -> ScriptStep:
+def _step(item: Json) -> ScriptStep:
     """Convert a JSON object to a command. Raises TypeError or ValueError: it is malformed."""
     kind = next((kind for kind in KINDS if kind in item), None)
     check(kind is not None, f"a command must have one of {', '.join(KINDS)}")

@@ -22,6 +22,7 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
 from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
@@ -227,7 +228,7 @@ class Platform(Suite):
         high = GROUND_LOWER[0]
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
-    def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
+    def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, Json, np.ndarray]]:
         """Yield the test grounds: name, arguments for `Env`, headings [rad] (num_envs,); goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight

@@ -18,6 +18,7 @@ from jumper_warp.evaluation.run import HEADLINES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation, with_jump_terminations
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
 
@@ -52,7 +53,7 @@ class Suite(EvaluationArgs, ABC):
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, write plots into `run.folder`, and return the metrics by key."""
 
-    def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
+    def run(self, modules: Iterable[ModuleType] = ()) -> Json:
         """Run the suite on its policy, write and print the metrics, and return them; modules: the user's task modules.
 
         Raises PolicyError, CheckpointError or InputError, see `EvaluationRun.from_args`.
@@ -67,9 +68,15 @@ class Suite(EvaluationArgs, ABC):
         return run, self.measure(run)
 
     def run_landings(
-        self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
-        delay: np.ndarray | float = DELAY, **options: Any,
-    ) -> JumpLog:  # fmt: skip
+        self,
+        run: EvaluationRun,
+        goals: np.ndarray,
+        env: Env | None = None,
+        *,
+        headings: np.ndarray | None = None,
+        delay: np.ndarray | float = DELAY,
+        **options: Any,
+    ) -> JumpLog:
         """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
         env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `JumpLog`; options:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from jumper_warp.evaluation.jumps import wrapped
 from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
@@ -175,7 +176,7 @@ class VelocityLog(EvaluationLog):
         """Return values to plot: the current velocities and commands of all robots."""
         return velocity_series(self.velocity[-1], self.command_history()[-1])
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: commands of some robots and their times, keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 

@@ -25,7 +25,7 @@ from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.errors import InputError, suggestion
-from jumper_warp.utils.files import directory_lock, json_bytes, parse_json, read_file, write_atomically
+from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, write_atomically
 
 MANIFEST = "manifest.json"
 CONFIG = "config.json"
@@ -172,7 +172,7 @@ def check_version(path: Path, content: Mapping[str, Any]) -> None:
         raise PolicyError(f"{path}: {version_error(f'{version!r:.20}', SCHEMA_VERSION)}")
 
 
-def parse_object(path: Path, data: bytes) -> dict[str, Any]:
+def parse_object(path: Path, data: bytes) -> Json:
     """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none."""
     content = parse_json(data, str(path), PolicyError)
     if not isinstance(content, dict):
@@ -192,11 +192,11 @@ class PolicySummary:
     task: str
     about: str  # First paragraph of README.md, without markup
     size_bytes: int  # Size of policy.onnx
-    rows: list[dict[str, Any]]
+    rows: list[Json]
     """Metrics by condition, as in metrics.json: condition, seed, conditions, metrics; empty: not evaluated."""
 
     @property
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Json:
         """Metrics of the policy's first test condition, as in metrics.json; may be empty.
 
         In the project's policies this is the nominal robot.
@@ -211,7 +211,7 @@ class PolicySummary:
         return rates[0] if rates else None if falls is None else 1.0 - falls
 
     @property
-    def error(self) -> dict[str, Any] | None:
+    def error(self) -> Json | None:
         """Error in the first test condition, such as the mean apex error, as in metrics.json; None: not evaluated."""
         return next((self.metrics[key] for key in ERRORS if key in self.metrics), None)
 

@@ -51,7 +51,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import directory_lock, json_bytes, parse_json, read_file, read_json, write_atomically
+from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, read_json, write_atomically
 from jumper_warp.utils.normalise import normalise
 from jumper_warp.utils.runtime import source_versions
 
@@ -227,7 +227,7 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
         raise CheckpointError(f"{path}: not a training checkpoint of this project ({reason})") from error
 
 
-def _policy_of_rsl_rl(state: dict[str, Any]) -> Policy:
+def _policy_of_rsl_rl(state: Json) -> Policy:
     """Return the policy in a checkpoint of rsl-rl 5, to which `config` (`env`, perhaps `train`) is added."""
     config = state["config"]
     actor = state["actor_state_dict"]
@@ -241,7 +241,7 @@ def _policy_of_rsl_rl(state: dict[str, Any]) -> Policy:
     return _policy_of_weights(config, int(state["iter"]), layers, mean, std, activation, RSL_RL_LIMIT)
 
 
-def _policy_of_checkpoint(state: dict[str, Any]) -> Policy:
+def _policy_of_checkpoint(state: Json) -> Policy:
     """Return the policy in a checkpoint of this package; a mirror-symmetric actor becomes a plain network."""
     config = parse_json(state["config"], "config")
     model = state["ppo"]["model"]
@@ -256,13 +256,7 @@ def _policy_of_checkpoint(state: dict[str, Any]) -> Policy:
 
 
 def _policy_of_weights(
-    config: dict[str, Any],
-    iteration: int,
-    layers: Weights,
-    mean: torch.Tensor,
-    std: torch.Tensor,
-    activation: str,
-    limit: float,
+    config: Json, iteration: int, layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, limit: float
 ) -> Policy:
     """Return the policy of a training, with the code version of its run and the iteration in the configuration.
 
@@ -283,7 +277,7 @@ def _policy_of_weights(
     return Policy(layers, mean, std, spec, {**config, **source})
 
 
-def _actor_layers(model: dict[str, Any], prefix: str) -> Weights:
+def _actor_layers(model: Json, prefix: str) -> Weights:
     """Return weight (out, in) and bias (out,) of the actor's layers, first to last, from a model's state_dict."""
     names = [key for key in model if key.startswith(prefix) and key.endswith(".weight")]
     names.sort(key=lambda key: int(key.split(".")[1]))
@@ -401,10 +395,13 @@ def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
     if policy.interface != other.interface:
         raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
     rescaled = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
-    layers = [
-        tuple((1.0 - fraction) * mine.double() + fraction * theirs for mine, theirs in zip(layer, layer_2, strict=True))
-        for layer, layer_2 in zip(policy.layers, rescaled, strict=True)
-    ]
+
+    def interpolate(tensor: torch.Tensor, other_tensor: torch.Tensor) -> torch.Tensor:
+        """Return the weighted mean of two tensors of one shape, float64."""
+        return (1.0 - fraction) * tensor.double() + fraction * other_tensor
+
+    pairs = zip(policy.layers, rescaled, strict=True)
+    layers = [(interpolate(w, other_w), interpolate(b, other_b)) for (w, b), (other_w, other_b) in pairs]
     origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
     config = policy.config | {"blended": {"share": fraction, **origin}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config)
@@ -428,7 +425,7 @@ def task_symmetry(task: TaskCfg) -> Symmetry:
     return Symmetry(mirror_map(*mirror_of(task, "actor"), "observation"), mirror_map(*mirror_of_action(), "action"))
 
 
-def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
+def check_interface(policy: PolicyInterface, task: Json) -> None:
     """Raise InputError with the first difference, if a policy and a task differ in observation or joints.
 
     task: its description by `jumper_warp.tasks.interface`.
@@ -438,7 +435,7 @@ def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
             raise InputError(f"init_policy: {quantity}: the policy has {policy_value}, the task {task_value}")
 
 
-def _compared_values(policy: PolicyInterface, task: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+def _compared_values(policy: PolicyInterface, task: Json) -> Iterator[tuple[str, Any, Any]]:
     """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value)."""
     for label, field in (("observation", "observation_names"), ("action", "joint_names")):
         for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):

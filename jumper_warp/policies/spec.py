@@ -10,6 +10,7 @@ from typing import Any
 
 from jumper_warp.utils.checks import ACTIVATIONS, NAME, check_angle_limits, check_filter_speed, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 FULL_TURN = 2.0 * math.pi
 JOINT_BOUNDS = {
@@ -55,12 +56,12 @@ class PolicyInterface:
     joint_stiffness: tuple[float, ...]  # [N m/rad]
     joint_damping: tuple[float, ...]  # [N m s/rad]
     torque_limit: tuple[float, ...]  # [N m]
-    command_filter: dict[str, Any]  # fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]
+    command_filter: Json  # fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]
     policy_dt: float  # [s] Time between actions
     physics_dt: float  # [s] Physics step of the training
     hidden: tuple[int, ...]  # widths of the hidden layers
     activation: str = "elu"
-    observation_layout: dict[str, Any] = field(default_factory=dict)
+    observation_layout: Json = field(default_factory=dict)
     """Observation terms by name, each with first and end column, scale, clip and history; empty if unknown."""
     observation_limit: float = 100.0  # raw observations are clamped to ± this; entries that are not finite count as 0
     normalised_limit: float = 10.0  # normalised observations are clamped to ± this many standard deviations
@@ -98,7 +99,7 @@ class PolicyInterface:
         """Sizes of observation, hidden layers and action, in this order."""
         return (len(self.observation_names), *self.hidden, len(self.joint_names))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the interface's fields as a JSON object."""
         return dataclasses.asdict(self)
 
@@ -113,10 +114,9 @@ class PolicyInterface:
         different = sorted(set(data) ^ {spec.name for spec in dataclasses.fields(cls)})
         if different:
             raise PolicyError(f"interface fields missing or unknown: {', '.join(different):.200}")
+        values: Json = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
         try:
-            interface = cls(
-                **{name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-            )
+            interface = cls(**values)
             check_types("interface field", interface)
         except PolicyError:
             raise
@@ -125,7 +125,7 @@ class PolicyInterface:
         return interface
 
 
-def _check_filter(fields: dict[str, Any]) -> None:
+def _check_filter(fields: Json) -> None:
     """Raise PolicyError unless a command filter has exactly the fields of `FilterCfg`, with valid values."""
     if set(fields) != {*FILTERED, "horizon", "speed_floor"}:
         raise PolicyError(f"command_filter must have the fields {', '.join(FILTERED)}, horizon, speed_floor")
@@ -137,7 +137,7 @@ def _check_filter(fields: dict[str, Any]) -> None:
         raise PolicyError(f"command_filter: {error}") from error
 
 
-def _check_layout(layout: dict[str, Any], width: int) -> None:
+def _check_layout(layout: Json, width: int) -> None:
     """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps."""
     first = 0
     for name, term in layout.items():
@@ -168,12 +168,7 @@ def checksum_entry(data: bytes) -> bytes:
 
 
 def make_interface(
-    description: dict[str, Any],
-    *,
-    policy_dt: float,
-    physics_dt: float,
-    hidden: tuple[int, ...],
-    activation: str = "elu",
+    description: Json, *, policy_dt: float, physics_dt: float, hidden: tuple[int, ...], activation: str = "elu"
 ) -> PolicyInterface:
     """Return the interface (observation, action, motors, time steps) of policies for a task.
 

@@ -13,6 +13,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,7 +121,7 @@ def check_types(section: str, cfg: Any) -> None:
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: type) -> Json:
     """Return the types of a dataclass's fields by name; empty if one of them cannot be evaluated."""
     try:
         return get_type_hints(kind)

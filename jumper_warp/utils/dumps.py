@@ -10,7 +10,7 @@ import numpy as np
 
 from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import parse_json
+from jumper_warp.utils.files import Json, parse_json
 
 FORMAT, VERSION = "jumper-warp dump", 1
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
@@ -44,7 +44,7 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
     write_npz(path, header=np.array(json.dumps(header, allow_nan=False)), **found.arrays)
 
 
-def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
+def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
     """Read a non-finite value and the header from a file that `write_dump` has written in a training.
 
     Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, or of another kind or version.

@@ -12,6 +12,7 @@ from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
+Json = dict[str, Any]  # Object of JSON data, settings or values by name
 ErrorType = Callable[[str], InputError]
 MAX_BYTES = 256 * 2**20  # Size of the largest file that is read
 MAX_JSON_BYTES = 16 * 2**20  # Size of the largest JSON file that is read
@@ -101,7 +102,7 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
     where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
     not JSON, nests too deeply, repeats a key, or has such a number.
     """
-    hooks: dict[str, Any] = {"parse_constant": _number, "parse_float": _number} if finite else {}
+    hooks: Json = {"parse_constant": _number, "parse_float": _number} if finite else {}
     try:
         return json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
     except json.JSONDecodeError as problem:
@@ -111,7 +112,7 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
     raise error(f"{where}: not JSON ({reason:.200})")
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> Json:
     """Convert the (key, value) pairs of a JSON object to a dict. Raises InputError: a key occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):

@@ -152,9 +152,11 @@ def resampled_means(rows: np.ndarray) -> np.ndarray:
 
 
 def print_metrics(
-    metrics: AnyMetrics, paper: Mapping[str, float] | None = None, conditions: Mapping[str, Any] | None = None,
+    metrics: AnyMetrics,
+    paper: Mapping[str, float] | None = None,
+    conditions: Mapping[str, Any] | None = None,
     title: str = "",
-) -> None:  # fmt: skip
+) -> None:
     """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line."""
     conditions = conditions or {}
     lists = {}

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.files import Json, json_bytes, write_atomically
 from jumper_warp.utils.metrics import AnyMetrics, MetricValue, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
@@ -22,15 +22,15 @@ class Report(NamedTuple):
     """Metrics of a run with the conditions in which they were measured, and the file that holds both."""
 
     path: Path  # of metrics.json
-    conditions: dict[str, Any]  # conditions of the evaluation by name
+    conditions: Json  # conditions of the evaluation by name
     metrics: dict[str, MetricValue]  # values are Python numbers, strings, None, or lists of these
 
     @property
-    def values(self) -> dict[str, Any]:
+    def values(self) -> Json:
         """Conditions, and values of the metrics without intervals, by name."""
         return self.conditions | {key: metric.value for key, metric in self.metrics.items()}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the content of metrics.json."""
         entries = {
             key: {"value": metric.value, "unit": unit_of(key)} | metric._asdict()
@@ -85,7 +85,7 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
     return report
 
 
-def read_values(folder: Path) -> dict[str, Any]:
+def read_values(folder: Path) -> Json:
     """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
     document = json.loads((folder / "metrics.json").read_bytes())
     return document["conditions"] | {key: entry["value"] for key, entry in document["metrics"].items()}

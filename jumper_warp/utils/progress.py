@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from jumper_warp.utils.startup import open_standard_streams
 
@@ -23,15 +22,6 @@ def format_duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60.0), 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
-
-
-class _TimeLeft(ProgressColumn):
-    """Column of the progress display with the estimated time left; empty if it is unknown."""
-
-    def render(self, task: Task) -> Text:
-        """Return the estimated time left of a task as text."""
-        seconds = task.time_remaining
-        return Text("" if seconds is None else f"{format_duration(seconds)} left")
 
 
 @contextmanager
@@ -48,7 +38,7 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         return
     progress, outer = _shown, _shown
     if progress is None:
-        columns = ("{task.description}", BarColumn(20), TimeElapsedColumn(), _TimeLeft())
+        columns = ("{task.description}", BarColumn(20), TimeElapsedColumn(), TimeRemainingColumn())
         # prints to another file than the terminal must not be redirected to it
         progress = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
         progress.start()

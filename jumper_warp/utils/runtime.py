@@ -6,11 +6,12 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.startup import open_standard_streams
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
@@ -114,7 +115,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return result.stdout if result.returncode == 0 else None
 
 
-def source_versions() -> dict[str, Any]:
+def source_versions() -> Json:
     """Return this package's git commit and whether files have changed (None without git), and versions of packages."""
     commit = git_commit()
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}

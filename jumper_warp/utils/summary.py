@@ -35,9 +35,16 @@ class PrintFlags:
 
 
 def print_summary(
-    report: Report, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
-    flags: PrintFlags | None = None, trial: str = "trial", films: Iterable[Path] = (),
-) -> None:  # fmt: skip
+    report: Report,
+    title: str,
+    keys: Iterable[str],
+    *,
+    seconds: float,
+    paper: Mapping[str, float] | None = None,
+    flags: PrintFlags | None = None,
+    trial: str = "trial",
+    films: Iterable[Path] = (),
+) -> None:
     """Print a summary of a run: title, main metrics (by `keys`) and paths of its files, 80 columns wide.
 
     title: what was done; keys: of the main metrics, those that the report lacks are skipped; seconds: wall time of the

@@ -10,13 +10,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
@@ -97,9 +96,13 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye:
 
 
 def _images(
-    recording: Recording, times: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None, ranks: Sequence[int],
+    recording: Recording,
+    times: np.ndarray,
+    size: tuple[int, int],
+    eye: Sequence[float] | None,
+    ranks: Sequence[int],
     name: str,
-) -> Iterator[Image.Image]:  # fmt: skip
+) -> Iterator[Image.Image]:
     """Yield the annotated images of a film at `times` [s], with a progress bar; name: label of the bar."""
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
     poses = drawn_poses(recording, times)
@@ -193,9 +196,7 @@ def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
     return "   ".join(filter(None, [recording.heading(ranks), f"{time:.2f} s"]))
 
 
-def _encode_mp4(
-    path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float
-) -> None:  # fmt: skip
+def _encode_mp4(path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float) -> None:
     """Write images as H.264 in yuv420p, for browsers and slides. Raises OSError, about `target`: ffmpeg fails."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -220,6 +221,6 @@ def _encoded_animation(images: Iterator[Image.Image], kind: str, fps: float, cou
     tick = 10 if kind == "gif" else 1  # [ms] unit of the durations in the file
     ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)
     durations = np.diff(ends).tolist()  # [ms]
-    options: dict[str, Any] = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
+    options: Json = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
     pictures[0].save(data, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)
     return data.getvalue()

@@ -200,9 +200,14 @@ def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def write_picture(
-    recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, eye: Sequence[float] | None = None,
+    recording: Recording,
+    path: Path,
+    *,
+    rank: int = 0,
+    width: int = WIDTH,
+    eye: Sequence[float] | None = None,
     title: str | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a composite picture (.png, .webp or .jpg) of one world of a recording; return its path.
 
     rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. eye: direction of

@@ -62,10 +62,20 @@ class Published:
 
 
 def plot_sweep(
-    path: Path, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, *, tolerance: float, paper: Published,
-    limit: np.ndarray | None = None, trained: Mapping[str, Sequence[float]] | None = None,
-    labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
-) -> None:  # fmt: skip
+    path: Path,
+    commanded: np.ndarray,
+    reached: np.ndarray,
+    good: np.ndarray,
+    *,
+    tolerance: float,
+    paper: Published,
+    limit: np.ndarray | None = None,
+    trained: Mapping[str, Sequence[float]] | None = None,
+    labels: tuple[str, str],
+    marks: tuple[str, str],
+    title: str,
+    conditions: str,
+) -> None:
     """Plot reached over commanded values of a sweep, and below them the errors with their running mean.
 
     Errors beyond the range of the lower axes are marked at its edge.
@@ -137,9 +147,14 @@ def plot_running_mean(axis: Any, commanded: np.ndarray, error: np.ndarray) -> No
 
 
 def plot_landings(
-    path: Path, tests: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], *, tolerance: float, title: str,
-    conditions: str, outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
-) -> None:  # fmt: skip
+    path: Path,
+    tests: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    *,
+    tolerance: float,
+    title: str,
+    conditions: str,
+    outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
+) -> None:
     """Plot goals and landing positions from above, relative to the start, one panel per test.
 
     tests: by title of the panel, goals [m] and landing positions [m], (jumps, 2), and success (jumps,); tolerance [m]:
@@ -181,9 +196,15 @@ def regular_polygons(centers: np.ndarray, radius: float, corners: int = 48) -> n
 
 
 def plot_distances(
-    path: Path, distances: Sequence[float], successes: Mapping[str, np.ndarray], errors: np.ndarray, *,
-    reliable: float, published: Mapping[str, float], conditions: str,
-) -> None:  # fmt: skip
+    path: Path,
+    distances: Sequence[float],
+    successes: Mapping[str, np.ndarray],
+    errors: np.ndarray,
+    *,
+    reliable: float,
+    published: Mapping[str, float],
+    conditions: str,
+) -> None:
     """Plot success rates and mean errors of bins of distances, with their 95 % intervals.
 
     distances [m]: middles of the bins; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;

@@ -92,6 +92,29 @@ def test_flag_of_a_duration_may_be_infinite_for_never(capsys):
     assert run(capsys, "train", "vertical-jump", *flags.split())[2][-1] == "jumper: /none: no such folder (policy)"
 
 
+@pytest.mark.parametrize(
+    ("args", "place"),
+    [
+        (["train", "vertical-jump", "--resume", ""], "after --resume"),
+        (["train", "vertical-jump", "--init-policy="], "of --init-policy"),
+        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "after --log-root"),
+        (["train", ""], "after train"),
+        (["evaluate", "vertical_jump", "--out", ""], "after --out"),
+        (["evaluate", ""], "after evaluate"),
+        (["play", "--script", ""], "after --script"),
+        (["export", "vertical_jump", "--out="], "of --out"),
+        (["sysid", "fit", ""], "after fit"),
+        (["list", "--task-module", ""], "after --task-module"),
+    ],
+    ids=str,
+)
+def test_refuses_empty_values(capsys, tmp_path, monkeypatch, args, place):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *args)
+    assert (code, out, len(err)) == (2, "", 1) and not list(tmp_path.iterdir())
+    assert err == [f"jumper: empty value {place}"]
+
+
 def test_input_error_prints_one_line(capsys, monkeypatch):
     def raise_input_error(*_):
         raise InputError("expected a,\n  got b")
