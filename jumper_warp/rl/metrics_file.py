@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from contextlib import suppress
 from pathlib import Path
 
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import existing_file, write_atomically
 
 METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object per logged iteration
 
@@ -18,9 +19,9 @@ class MetricsFile:
     def __init__(self, path: Path, iteration: float) -> None:
         """Open the metrics file to continue after `iteration`; later iterations and malformed lines are removed.
 
-        Raises OSError: the file cannot be read or written.
+        Raises InputError: the path is no regular file. OSError: the file cannot be read or written.
         """
-        content = path.read_bytes() if path.is_file() else b""
+        content = existing_file(path, "metrics of a run", sys.maxsize).read_bytes() if path.exists() else b""
         lines = content.splitlines()
         kept = [line for line in lines if _iteration_of(line) <= iteration]
         self.path = path

@@ -1,6 +1,5 @@
 """Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json, json_bytes, write_atomically
+from jumper_warp.utils.files import Json, json_bytes, read_json, write_atomically
 from jumper_warp.utils.metrics import AnyMetrics, MetricValue, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
@@ -86,9 +85,16 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 
 
 def read_values(folder: Path) -> Json:
-    """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
-    document = json.loads((folder / "metrics.json").read_bytes())
-    return document["conditions"] | {key: entry["value"] for key, entry in document["metrics"].items()}
+    """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name.
+
+    Raises InputError: the file is missing or damaged.
+    """
+    path = folder / "metrics.json"
+    document = read_json(path, "metrics of an evaluation")
+    try:
+        return document["conditions"] | {key: entry["value"] for key, entry in document["metrics"].items()}
+    except (LookupError, TypeError, AttributeError):
+        raise InputError(f"{path}: not the metrics of an evaluation") from None
 
 
 def _plain(name: str, value: Any) -> Any:

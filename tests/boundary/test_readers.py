@@ -10,6 +10,8 @@ from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.utils.dumps import load_dump
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values
+from jumper_warp.viz.recording import load_npz
 
 READERS = {
     "dump.npz": load_dump,
@@ -17,6 +19,8 @@ READERS = {
     "motion.csv": lambda path: load_motions([path]),
     "motion.parquet": lambda path: load_motions([path]),
     "robot.json": load_overlay,
+    "recording.npz": load_npz,
+    "metrics.json": lambda path: read_values(path.parent),
     "policy/manifest.json": lambda path: load_policy(path.parent),
 }
 
@@ -48,7 +52,7 @@ def test_file_that_is_not_regular_is_refused(damaged, make):
         read()
 
 
-@pytest.mark.parametrize("name", ["dump.npz", "motion.npz"])
+@pytest.mark.parametrize("name", ["dump.npz", "motion.npz", "recording.npz"])
 def test_archive_is_refused_before_it_is_unpacked_to_gigabytes(name, tmp_path):
     path = tmp_path / name
     np.savez_compressed(path, header=np.zeros(2**30 + 1, dtype=np.uint8))

@@ -39,7 +39,13 @@ def test_interrupted_command_ends_with_130_and_no_traceback(tmp_path):
     ]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     run = subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
     )
     first = run.stdout.readline()  # the command has begun
     run.send_signal(signal.SIGINT)

@@ -37,7 +37,7 @@ def seen(robot: mdp.RobotView, state: Any) -> float:
 def push(robot: mdp.RobotParameters, rng: mdp.RngStream):
     robot.push[rng.world] = wp.spatial_vector(value(), 0.0, 0.0, 0.0, 0.0, 0.0)
 """
-CELLS = {INNER: (2.0, 3.0), HELPER: (10.0, 20.0), PYTHON: (100.0, 200.0), CONSTANT: (1.0, 2.0), NESTED: (0.0, 0.5)}
+CELLS = {INNER: (2.0, 3.0), HELPER: (10.0, 20.0), PYTHON: (10.0, 30.0), CONSTANT: (1.0, 2.0), NESTED: (0.0, 0.5)}
 """Cells whose number changes: its first value and the one of the second run."""
 
 
@@ -79,13 +79,13 @@ def notebook():
     notebook = Notebook()
     for cell in (IMPORTS, *(cell.format(value) for cell, (value, _) in CELLS.items()), TERMS):
         notebook.run(cell)
-    assert notebook.values() == [112.0] * 3
+    assert notebook.values() == [22.0] * 3
     return notebook
 
 
 @pytest.mark.parametrize(
     ("cell", "value"),
-    [(INNER, 113.0), (HELPER, 122.0), (PYTHON, 212.0), (CONSTANT, 124.0), (NESTED, 112.5)],
+    [(INNER, 23.0), (HELPER, 32.0), (PYTHON, 42.0), (CONSTANT, 34.0), (NESTED, 22.5)],
     ids=["called function", "calling function", "Python constant", "wp.constant", "attribute"],
 )
 def test_a_cell_that_runs_again_changes_the_terms_of_a_new_environment(notebook, cell, value):
@@ -93,7 +93,7 @@ def test_a_cell_that_runs_again_changes_the_terms_of_a_new_environment(notebook,
     notebook.run(cell.format(second))
     assert notebook.values() == [value] * 3
     notebook.run(cell.format(first))
-    assert notebook.values() == [112.0] * 3
+    assert notebook.values() == [22.0] * 3
 
 
 def test_a_helper_that_returns_another_type_is_refused_in_one_line(notebook):

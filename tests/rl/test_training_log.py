@@ -8,6 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, push_cfg
 
 METRICS = {"Perf/total_fps": 1234.0, "Perf/elapsed_s": 5.0, "Metrics/success": 0.5}  # steps per second, time, fraction
@@ -99,6 +100,13 @@ def test_metrics_file_is_repaired_on_opening(tmp_path, content, kept):
     path.write_bytes(content)
     MetricsFile(path, 2).add(3, {})
     assert iterations(path) == [*kept, 3]
+
+
+def test_metrics_file_that_is_not_regular_is_refused(tmp_path):
+    path = tmp_path / METRICS_FILE
+    path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="not a regular file"):
+        MetricsFile(path, 2)
 
 
 def test_resume_hides_tensorboard_events_of_later_iterations(cfg):
