@@ -159,8 +159,15 @@ def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
         v = robot.closed_velocity(q, twist, rates)
         acceleration = robot.forward_dynamics(q, v, torque)
         level = robot.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
-        rows.append((acceleration[:3] + np.cross(v[3:6], v[:3]), acceleration[3:6], acceleration[robot.motor_v],
-                     robot.paw_positions(level), robot.paw_jacobians(level)))  # fmt: skip
+        rows.append(
+            (
+                acceleration[:3] + np.cross(v[3:6], v[:3]),
+                acceleration[3:6],
+                acceleration[robot.motor_v],
+                robot.paw_positions(level),
+                robot.paw_jacobians(level),
+            )
+        )
     names = ("base_acceleration", "base_angular_acceleration", "joint_acceleration", "paw_position", "paw_jacobian")
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 

@@ -59,9 +59,12 @@ class PlainJump:
                 wp.copy(current, initial)
             for target in (self._targets[step] for step in range(len(targets))):
                 wp.launch(
-                    modules.command_filter.command_filter_kernel, dim=(4, n), device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[filtered],
-                )  # fmt: skip
+                    modules.command_filter.command_filter_kernel,
+                    dim=(4, n),
+                    device=rollout.device,
+                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits],
+                    outputs=[filtered],
+                )
                 dynamics.advance(settings, drive, self._q, self._qd, self._q, self._qd)
 
         run()

@@ -46,8 +46,15 @@ class SpringJumps:
 
     def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:
         """Return a simulation of `count` robots; robot: their parameters; settings: more arguments of `Simulation`."""
-        return Simulation(count, motors=self.motors, command_filter=FILTERS[self.filter](), gravity=self.gravity,
-                          robot=robot, device=self.device, **settings)  # fmt: skip
+        return Simulation(
+            count,
+            motors=self.motors,
+            command_filter=FILTERS[self.filter](),
+            gravity=self.gravity,
+            robot=robot,
+            device=self.device,
+            **settings,
+        )
 
     def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
         """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).

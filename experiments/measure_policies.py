@@ -140,9 +140,12 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
         for policy in args.policies
         for condition in args.conditions
         for seed in (args.seeds[:1] if condition in TESTS else args.seeds)
-        if (policy in TESTS[condition]["policies"] if condition in TESTS
-            else policy in tasks and undefined(tasks[policy], condition) is None)
-    ]  # fmt: skip
+        if (
+            policy in TESTS[condition]["policies"]
+            if condition in TESTS
+            else policy in tasks and undefined(tasks[policy], condition) is None
+        )
+    ]
     return [row for row in defined if not (args.row(*row) / METRICS).is_file()]
 
 

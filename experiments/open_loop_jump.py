@@ -72,9 +72,14 @@ def measure(args: Args, folder: Path) -> tuple[Json, str]:
     motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
     command_filter = loose_filter() if args.loose else vertical_jump_filter()
     sim = Simulation(
-        1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
+        1,
+        solver=args.solver,
+        motors=motors,
+        command_filter=command_filter,
+        gravity=args.gravity,
+        robot=robot,
         device=args.device,
-    )  # fmt: skip
+    )
     trace, recorder = simulate_jump(sim, variant, args.squat_angle)
     values: Json = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:

@@ -57,8 +57,10 @@ def published(task: TaskCfg) -> list[tuple[str, Results]]:
     evaluation = task.evaluation
     kind = evaluation.kind if evaluation == type(evaluation)() else ""  # else other tests than the published ones
     known = [(SIMULATION[kind], evaluation.paper)] if kind in SIMULATION else []
-    return [(words, {key: MetricValue(value) for key, value in values.items()})
-            for words, values in (*known, *PAGES["robot"].get(kind, ()))]  # fmt: skip
+    return [
+        (words, {key: MetricValue(value) for key, value in values.items()})
+        for words, values in (*known, *PAGES["robot"].get(kind, ()))
+    ]
 
 
 def kind_of(task: TaskCfg) -> str:
@@ -153,8 +155,11 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     nominal = rows["nominal"]
     note = f"{trials_of(nominal)} trials a row; commands: {nominal.values['commands']}.\n"
     note += f"Trained on {trained_on(task, nominal.values)}.\n"
-    reasons = [f"Not measured: {title}, since {reason}.\n"
-               for name, (title, _) in CONDITIONS.items() if (reason := undefined(task, name))]  # fmt: skip
+    reasons = [
+        f"Not measured: {title}, since {reason}.\n"
+        for name, (title, _) in CONDITIONS.items()
+        if (reason := undefined(task, name))
+    ]
     return "\n".join([markdown(["condition", *(column[0] for column in wide)], lines), note, *reasons])
 
 
@@ -175,8 +180,15 @@ def test_table(name: str) -> str:
 
 def key_table(name: str) -> str:
     """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
-    lines = [[f"`{metric.key}`", "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
-              metric.statistic.__name__, metric.over] for metric in KEYS[name]]  # fmt: skip
+    lines = [
+        [
+            f"`{metric.key}`",
+            "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
+            metric.statistic.__name__,
+            metric.over,
+        ]
+        for metric in KEYS[name]
+    ]
     return markdown(("key", "unit", "statistic", "over"), lines)
 
 
@@ -275,10 +287,16 @@ def seed_section(rows: Sequence[Row]) -> str:
         + ("These are:\n" if significant else "The smallest p-values are:\n")
     )
     lines = [
-        [test.policy, CONDITIONS[test.condition][0], f"`{test.key}`",
-         *(number(test.key, value) for value in test.values), f"{test.p:.2g}", f"{min(test.p * count, 1.0):.2g}"]
+        [
+            test.policy,
+            CONDITIONS[test.condition][0],
+            f"`{test.key}`",
+            *(number(test.key, value) for value in test.values),
+            f"{test.p:.2g}",
+            f"{min(test.p * count, 1.0):.2g}",
+        ]
         for test in significant or tests[:3]
-    ]  # fmt: skip
+    ]
     titles = ("policy", "condition", "metric", "first seed", "second seed", "p", "corrected p")
     return text + "\n" + markdown(titles, lines)
 

@@ -82,8 +82,14 @@ class MotionReplay:
         from jumper_warp.viz.recorder import Recorder
 
         self.problem = problem
-        self.sim = Simulation(1, motors=problem.motors, command_filter=problem.command_filter,
-                              friction=problem.friction, gravity=problem.gravity, device=problem.device)  # fmt: skip
+        self.sim = Simulation(
+            1,
+            motors=problem.motors,
+            command_filter=problem.command_filter,
+            friction=problem.friction,
+            gravity=problem.gravity,
+            device=problem.device,
+        )
         self.targets = targets
         self.recorder = Recorder(self.sim.model, notes=notes)
         rows: list[tuple] = []
@@ -98,8 +104,9 @@ class MotionReplay:
                 rows.append(self._physics_step(len(rows)))
             self._record(rows[-1])
         columns = (np.array(column) for column in zip(*rows, strict=True))
-        (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle,
-         self.torque) = columns  # fmt: skip
+        (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle, self.torque) = (
+            columns
+        )
         self._evaluate()
 
     def _physics_step(self, number: int) -> tuple:
@@ -136,9 +143,12 @@ class MotionReplay:
         clearance = wp.zeros(1, dtype=float, device=sim.device)
         robot = sim.physics.dynamics.robot
         wp.launch(
-            collision_kernel, dim=1, inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
-            outputs=[flags, clearance], device=sim.device,
-        )  # fmt: skip
+            collision_kernel,
+            dim=1,
+            inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
+            outputs=[flags, clearance],
+            device=sim.device,
+        )
         self.flags |= int(flags.numpy()[0])
         series = {"base/height [m]": row[1], "base/vertical speed [m s⁻¹]": row[2]}
         for i, name in enumerate(MOTOR_JOINTS):
@@ -180,8 +190,9 @@ class MotionReplay:
         q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
         parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
         device = str(self.problem.rollout(1).device)
-        return self.problem.motion_of(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
-                                                       for x in parts)))  # fmt: skip
+        return self.problem.motion_of(
+            TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device) for x in parts))
+        )
 
     @property
     def violation(self) -> float:

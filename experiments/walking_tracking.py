@@ -78,10 +78,15 @@ class GaitRecorder:
         mass = model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)
         weight = (mass * np.linalg.norm(model.gravity.numpy()[: len(mass)], axis=1))[standing]
         return gait_metrics(
-            np.array(self.contact)[:, standing], np.array(self.paw_height)[:, standing],
-            np.array(self.force)[:, standing], np.array(self.torque)[:, standing], np.array(self.power)[:, standing],
-            np.array(self.speed)[:, standing], weight, self.env.step_dt,
-        )  # fmt: skip
+            np.array(self.contact)[:, standing],
+            np.array(self.paw_height)[:, standing],
+            np.array(self.force)[:, standing],
+            np.array(self.torque)[:, standing],
+            np.array(self.power)[:, standing],
+            np.array(self.speed)[:, standing],
+            weight,
+            self.env.step_dt,
+        )
 
 
 def gait_metrics(
@@ -100,8 +105,12 @@ def gait_metrics(
     weight [N]: (robots,); step_dt [s]: policy step. The cost of transport is mean power / (weight * mean speed); None
     if a robot does not move. `share_down_<paws>` is the fraction of time in which exactly these paws touch the ground.
     """
-    apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
-                                           for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
+    apexes = np.concatenate(
+        [
+            np.zeros(0),
+            *(swing_apexes(contact[:, i, k], paw_height[:, i, k]) for i in range(contact.shape[1]) for k in range(4)),
+        ]
+    )
     seconds = len(contact) * step_dt
     robots = max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
@@ -338,15 +347,19 @@ def main(args: Args) -> dict:
     times = {"settling_time_median_s": median, "settling_time_for_half_a_second_median_s": held}
     return run.report(
         flags.metrics(walks)
-        | {name: MetricValue(time if np.isfinite(time) else None, env.num_envs, None, "redirected robots")
-           for name, time in times.items()}
-        | {"redirected_fall_rate": rate(redirected.fallen, "redirected robots"),
-           "kicked_fall_rate": rate(kicked.fallen, "kicked robots")}
+        | {
+            name: MetricValue(time if np.isfinite(time) else None, env.num_envs, None, "redirected robots")
+            for name, time in times.items()
+        }
+        | {
+            "redirected_fall_rate": rate(redirected.fallen, "redirected robots"),
+            "kicked_fall_rate": rate(kicked.fallen, "kicked robots"),
+        }
         | speed_metrics(fast, direction)
         | gait.metrics(~straight.fallen),
         PAPER,
         SUMMARY,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

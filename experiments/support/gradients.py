@@ -87,8 +87,10 @@ class GradientJump:
         jump = self.run(inputs)
         cotangent = np.zeros(jump.q.shape)
         cotangent[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
-        grads = {name: array.numpy()[..., 0].astype(float) for name, array in
-                 self.rollout.backward(jump, q=self.rollout.array(cotangent)).items()}  # fmt: skip
+        grads = {
+            name: array.numpy()[..., 0].astype(float)
+            for name, array in self.rollout.backward(jump, q=self.rollout.array(cotangent)).items()
+        }
         grads["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), grads["table"][:, None])["mass"][:, 0]
         return jump, grads
 

@@ -130,8 +130,10 @@ class PinocchioRobot:
 
     def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
         """Return the knee angles (outer, inner) [rad] that close a leg's loop at given thigh angles [rad]."""
-        origin = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
-                  for name in ("outer", "inner", "outer_knee")}  # fmt: skip
+        origin = {
+            name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
+            for name in ("outer", "inner", "outer_knee")
+        }
         separation = abs(origin["outer"][0] - origin["inner"][0])
         thigh = -origin["outer_knee"][2]
         shank = -self.constraints[LEGS.index(leg)].joint1_placement.translation[2]

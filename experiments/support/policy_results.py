@@ -74,8 +74,10 @@ def ordered_rows(policy: str, saved: Iterable[tuple[str, int, Mapping[str, Any]]
     rows = []
     order = [*CONDITIONS, *TESTS]
     for condition, seed, data in saved:
-        metrics = {key: MetricValue(x["value"], x["trials"], x["interval"] and tuple(x["interval"]), x["over"])
-                   for key, x in data["metrics"].items()}  # fmt: skip
+        metrics = {
+            key: MetricValue(x["value"], x["trials"], x["interval"] and tuple(x["interval"]), x["over"])
+            for key, x in data["metrics"].items()
+        }
         rows.append(Row(policy, condition, seed, data["conditions"], metrics, data["metrics"]))
     return sorted(rows, key=lambda row: (order.index(row.condition), row.seed))
 
@@ -121,10 +123,11 @@ def save_to_policies(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> None:
         known = {row[1:3]: row for row in (*saved_rows(policy), *(row for row in rows if row.policy == policy))}
         data = {key: {"conditions": _conditions(row), "metrics": row.entries} for key, row in known.items()}
         lines = [
-            json.dumps({"condition": row.condition, "seed": row.seed} | data[row[1:3]], ensure_ascii=False,
-                       allow_nan=False)
+            json.dumps(
+                {"condition": row.condition, "seed": row.seed} | data[row[1:3]], ensure_ascii=False, allow_nan=False
+            )
             for row in ordered_rows(policy, [(*key, value) for key, value in data.items()])
-        ]  # fmt: skip
+        ]
         head = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False).removesuffix("\n}")
         text = f'{head},\n  "rows": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
         if policy == COMBINED:

@@ -116,8 +116,12 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         words = row["condition"].replace("_", " ")
         lines.append([words, *(_cell(column.key, row["metrics"].get(column.key)) for column in columns)])
     widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-    text = ["  ".join([line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:],
-            strict=True))]) for line in lines]  # fmt: skip
+    text = [
+        "  ".join(
+            [line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))]
+        )
+        for line in lines
+    ]
     trials = max(metric["trials"] or 0 for metric in shown[0]["metrics"].values())
     notes = [f"{trials:,} trials a line" + (f"; commands: {commands}" if commands else "")]
     if any("mujoco" in row["condition"] for row in shown):
@@ -168,16 +172,20 @@ def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[Json, list
     lines = [f"{name}: {entry.description}" if entry.description else name, ""]
     if content["details"] not in ("", entry.description):
         lines += [*textwrap.wrap(f"{content['details']}.", WIDTH), ""]
-    lines += properties({
-        "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
-        "critic": f"observes {sizes['critic']} numbers",
-        "action": f"{content['action_size']} motor angles",
-        "rewards": ", ".join(f"{term}{UNBROKEN}{weight:g}" for term, weight in rewards.items()),
-        "terminations": ", ".join(content["terminations"]),
-        "policies": ", ".join(content["policies"]), "aliases": ", ".join(entry.aliases), "module": entry.origin,
-        "train": command_line([name], modules).replace(" ", UNBROKEN),
-        "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
-    })  # fmt: skip
+    lines += properties(
+        {
+            "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
+            "critic": f"observes {sizes['critic']} numbers",
+            "action": f"{content['action_size']} motor angles",
+            "rewards": ", ".join(f"{term}{UNBROKEN}{weight:g}" for term, weight in rewards.items()),
+            "terminations": ", ".join(content["terminations"]),
+            "policies": ", ".join(content["policies"]),
+            "aliases": ", ".join(entry.aliases),
+            "module": entry.origin,
+            "train": command_line([name], modules).replace(" ", UNBROKEN),
+            "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
+        }
+    )
     return content, lines
 
 

@@ -62,10 +62,16 @@ def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[Json], list[
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             failures.append(f"task {name} of package {package} is left out: {reason:.300}")
     tasks = [
-        {"name": name, "about": entry.description, "aliases": list(entry.aliases), "module": entry.origin,
-         "package": packages.get(name), "policies": [policy.name for policy in policies if policy.task == name]}
+        {
+            "name": name,
+            "about": entry.description,
+            "aliases": list(entry.aliases),
+            "module": entry.origin,
+            "package": packages.get(name),
+            "policies": [policy.name for policy in policies if policy.task == name],
+        }
         for name, entry in TASKS.items()
-    ]  # fmt: skip
+    ]
     return tasks, failures
 
 

@@ -93,10 +93,13 @@ def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
     if len(set(names)) < len(names) or "" in names:
         raise InputError(f"{where}: the names of {', '.join(flags)} make the same flags")
     fields = [
-        (f"setting_{i}", Annotated[flag.kind, tyro.conf.arg(name=name, help=flag.about)],
-         dataclasses.field(metadata={"flag": name}))
+        (
+            f"setting_{i}",
+            Annotated[flag.kind, tyro.conf.arg(name=name, help=flag.about)],
+            dataclasses.field(metadata={"flag": name}),
+        )
         for i, (name, flag) in enumerate(zip(names, flags.values(), strict=True))
-    ]  # fmt: skip
+    ]
     kind = dataclasses.make_dataclass("Settings", fields, frozen=True, namespace={"__module__": NO_SOURCE})
     kind.__doc__ = about
     return Setting(kind, kind(*(flag.value for flag in flags.values())), about)

@@ -68,9 +68,13 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     for name, count, std, randomize, change_task in kinds:
         if count:
             conditions = Conditions(
-                randomize=randomize, noise=name == "randomized", seed=cfg.seed, stream="tuning", device=cfg.device,
+                randomize=randomize,
+                noise=name == "randomized",
+                seed=cfg.seed,
+                stream="tuning",
+                device=cfg.device,
                 threads=cfg.threads,
-            )  # fmt: skip
+            )
             robot = conditions.overlay(recipe.robot)
             if robot is not None and name == "late":
                 own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}

@@ -154,18 +154,35 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
     reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
     at_rest = landed & (jumps.rest_speed < REST_SPEED)
     return JumpOutcome(
-        commanded=commanded, to_height=to_height, early=jumps.early & commanded, reached=reached, landed=landed,
-        touched_down=np.isfinite(jumps.touchdown[..., 0]), at_rest=at_rest, success=reached & at_rest & ~jumps.early,
-        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS), hopped=jumps.air_time > HOP_TIME + TIME_EPS,
-        took_off_again=jumps.takeoffs > 0, fell=np.isin(ends, FALLS), collided=ends == COLLIDED, diverged=diverged,
-        missed=landed & ~reached, no_jump=ends == "no_jump", apex_m=known(jumps.apex),
-        apex_error_m=np.where(to_height, apex_error, np.nan), distance_at_end_m=goal_distance(jumps.end_position),
-        distance_at_touchdown_m=goal_distance(jumps.touchdown), distance_at_rest_m=distance_at_rest,
-        ahead_m=known(ahead), left_m=known(left), drift_m=known(jumps.drift),
+        commanded=commanded,
+        to_height=to_height,
+        early=jumps.early & commanded,
+        reached=reached,
+        landed=landed,
+        touched_down=np.isfinite(jumps.touchdown[..., 0]),
+        at_rest=at_rest,
+        success=reached & at_rest & ~jumps.early,
+        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS),
+        hopped=jumps.air_time > HOP_TIME + TIME_EPS,
+        took_off_again=jumps.takeoffs > 0,
+        fell=np.isin(ends, FALLS),
+        collided=ends == COLLIDED,
+        diverged=diverged,
+        missed=landed & ~reached,
+        no_jump=ends == "no_jump",
+        apex_m=known(jumps.apex),
+        apex_error_m=np.where(to_height, apex_error, np.nan),
+        distance_at_end_m=goal_distance(jumps.end_position),
+        distance_at_touchdown_m=goal_distance(jumps.touchdown),
+        distance_at_rest_m=distance_at_rest,
+        ahead_m=known(ahead),
+        left_m=known(left),
+        drift_m=known(jumps.drift),
         distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
         paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
-        tilt_deg=known(np.degrees(jumps.tilt)), turn_deg=known(np.degrees(np.abs(jumps.yaw))),
-    )  # fmt: skip
+        tilt_deg=known(np.degrees(jumps.tilt)),
+        turn_deg=known(np.degrees(np.abs(jumps.yaw))),
+    )
 
 
 class JumpLog(EvaluationLog):

@@ -72,9 +72,14 @@ class EnvRecorder:
         self.frames += 1
         series = log.named(log.series(), self.worlds) | self._motor_series()
         self.recorder.record(
-            self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces,
-            states=log.named(log.states(), self.worlds), commands=self._marks().get("commands"),
-        )  # fmt: skip
+            self.frames * self.env.step_dt,
+            poses.reshape(-1, 7),
+            series,
+            ankles(poses),
+            forces,
+            states=log.named(log.states(), self.worlds),
+            commands=self._marks().get("commands"),
+        )
 
     def _marks(self) -> dict[str, np.ndarray]:
         """Return goals, heights and commands of the recorded worlds, which the log's `marks` gives."""

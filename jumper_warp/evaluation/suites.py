@@ -158,10 +158,15 @@ class Consecutive(Suite):
         paths = []
         for name, goals in (("pairs", pairs), ("row", rows)):
             positions: list[np.ndarray] = []
-            logs.append(self.run_landings(
-                run, goals, delay=rng.uniform(*DELAYS, len(goals)), film=name,
-                on_step=lambda log, to=positions: to.append(running_positions(log)),
-            ))  # fmt: skip
+            logs.append(
+                self.run_landings(
+                    run,
+                    goals,
+                    delay=rng.uniform(*DELAYS, len(goals)),
+                    film=name,
+                    on_step=lambda log, to=positions: to.append(running_positions(log)),
+                )
+            )
             paths.append(turn_plane(np.stack(positions, axis=1), -logs[-1].headings[:, None]))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
@@ -326,8 +331,15 @@ class Farthest(Suite):
         }
         errors = np.array([np.where(o.success, o.distance_at_rest_m, np.nan)[:, 0] for o in outcomes])
         conditions = f"{run.title}, {self.num_jumps} jumps each"
-        plot_distances(run.folder / "max_jump.png", [*bins], successes, errors, reliable=RELIABLE, published=PUBLISHED,
-                       conditions=conditions)  # fmt: skip
+        plot_distances(
+            run.folder / "max_jump.png",
+            [*bins],
+            successes,
+            errors,
+            reliable=RELIABLE,
+            published=PUBLISHED,
+            conditions=conditions,
+        )
         return distance_metrics(bins)
 
 
@@ -351,8 +363,12 @@ def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     bins: logs by distance at the bin's middle [m], ascending.
     """
     outcomes = [landings.outcome for landings in bins.values()]
-    together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
-                              for name in (field.name for field in fields(JumpOutcome))})  # fmt: skip
+    together = JumpOutcome(
+        **{
+            name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
+            for name in (field.name for field in fields(JumpOutcome))
+        }
+    )
     goals = np.concatenate([landings.goals for landings in bins.values()])
     inside = within(goals[..., 0], IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]

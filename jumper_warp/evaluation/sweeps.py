@@ -160,11 +160,18 @@ class HeightSweep(Sweep):
         jumps = self.run_sweep(run, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         plot_sweep(
-            run.folder / "sweep.png", jumps.goals[:, 0, 2], jumps.apex[:, 0], jumps.outcome.reached[:, 0], limit=limit,
-            tolerance=TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
+            run.folder / "sweep.png",
+            jumps.goals[:, 0, 2],
+            jumps.apex[:, 0],
+            jumps.outcome.reached[:, 0],
+            limit=limit,
+            tolerance=TOLERANCE,
+            paper=PAPER_HEIGHTS,
+            marks=("reached", "missed"),
+            title="Jumps to heights",
             labels=("commanded base height [m]", "highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
-        )  # fmt: skip
+        )
         inside = within(jumps.goals[..., 2], self.flags.success_range)
         values = limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
         return self.flags.metrics(jumps) | values | self.pushed_in_flight(run, with_jump_terminations)
@@ -220,10 +227,16 @@ class DistanceSweep(Sweep):
         landings = self.run_sweep(run, run.env(self.num_jumps, change), "jumps")
         trained = trained_range(run.task)["trained_range_m"]
         plot_sweep(
-            run.folder / "sweep.png", landings.goals[:, 0, 0], landings.landing[:, 0, 0],
-            landings.success[:, 0], tolerance=TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
+            run.folder / "sweep.png",
+            landings.goals[:, 0, 0],
+            landings.landing[:, 0, 0],
+            landings.success[:, 0],
+            tolerance=TOLERANCE,
+            paper=PAPER_DISTANCES,
+            marks=("on goal", "failed"),
             trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
-            labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
+            labels=("commanded distance [m]", "distance of the base at the end [m]"),
+            title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
-        )  # fmt: skip
+        )
         return self.metrics(landings) | self.pushed_in_flight(run, change)

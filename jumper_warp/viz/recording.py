@@ -162,10 +162,14 @@ def _check_arrays(recording: Recording) -> None:
     frames, worlds, bodies = (len(part) for part in (recording.times, recording.worlds, recording.bodies))
     contacts, goals = recording.contact_points.shape[2:3], recording.goals.shape[1:2]
     for name, *shapes in (
-        ("times", (frames,)), ("poses", (frames, bodies, 7)), ("contact_points", (frames, worlds, *contacts, 3)),
-        ("contact_forces", (frames, worlds, *contacts, 3)), ("goals", (worlds, *goals, 3), (0, *goals, 3)),
-        ("heights", (worlds,), (0,)), ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
-    ):  # fmt: skip
+        ("times", (frames,)),
+        ("poses", (frames, bodies, 7)),
+        ("contact_points", (frames, worlds, *contacts, 3)),
+        ("contact_forces", (frames, worlds, *contacts, 3)),
+        ("goals", (worlds, *goals, 3), (0, *goals, 3)),
+        ("heights", (worlds,), (0,)),
+        ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
+    ):
         values = getattr(recording, name)
         _check(name, values.dtype.kind in "fiu" and values.shape in shapes)
     for values in recording.series.values():
