@@ -71,9 +71,8 @@ class PlainJump:
         with wp.ScopedCapture(device=rollout.device) as capture:
             run()
         assert capture.graph is not None
-        # a graph on a GPU keeps no arrays alive
         self._graph = capture.graph
-        self._arrays = (drive, filtered, wrench)
+        self._arrays = (drive, filtered, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:
         """Simulate the jump by replaying the graph."""

@@ -90,13 +90,11 @@ class Run(ABC):
         from jumper_warp.robot.model import PHYSICS_DT
 
         self.started = time.perf_counter()
-        # Conditions of all episodes; number of worlds to record
-        self.conditions = Conditions()
-        self.record = 0
+        self.conditions = Conditions()  # Conditions of all episodes
+        self.record = 0  # Number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
-        # Name of the evaluation; what `report` prints
-        self.name = ""
-        self.print_flags = PrintFlags()
+        self.name = ""  # Name of the evaluation
+        self.print_flags = PrintFlags()  # Selects what `report` prints
         self.settings: Json = {}  # Settings of task, robot and test, reported with the conditions
         self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
