@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.stats
@@ -226,16 +226,6 @@ def _success(row: Row, kind: str) -> str:
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
 
 
-class SeedTest(NamedTuple):
-    """Significance test of the difference of one metric between two seeds."""
-
-    policy: str
-    condition: str
-    key: str
-    values: tuple[Any, Any]
-    p: float  # Two-sided
-
-
 def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
     """Return the two-sided p-value of the hypothesis that two rates or two means are equal.
 
@@ -257,48 +247,33 @@ def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
     return float(scipy.stats.ttest_ind_from_stats(*samples, equal_var=False).pvalue)
 
 
-def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
-    """Test every metric for a difference between the first two seeds of each policy and condition.
+def seed_tests(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
+    """Return the p-value of the difference of each metric between the first two seeds, by policy, condition and key.
 
     Metrics without an interval or with fewer than LEAST trials are left out.
     """
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         pairs.setdefault(row[:2], []).append(row)
-    tests = []
+    tests = {}
     for (policy, condition), (first, *others) in pairs.items():
         for key, a in first.metrics.items() if others else ():
             b = others[0].metrics.get(key, MetricValue(None))
             if a.interval and b.interval and min(a.trials or 0, b.trials or 0) >= LEAST:
-                tests.append(SeedTest(policy, condition, key, (a.value, b.value), difference_p(key, a, b)))
+                tests[policy, condition, key] = difference_p(key, a, b)
     return tests
 
 
 def seed_section(rows: Sequence[Row]) -> str:
     """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
-    tests = sorted(seed_tests(rows), key=lambda test: test.p)
-    count = len(tests)
-    compared = len({test[:2] for test in tests})
-    significant = [test for test in tests if test.p * count < LEVEL]
-    text = (
-        f"{compared} rows were measured with two seeds. Each of their {count:,} rates and means was compared:\n"
+    tests = seed_tests(rows)
+    compared = len({names[:2] for names in tests})
+    significant = [f"- {', '.join(names)}: p = {p:.2g}\n" for names, p in tests.items() if p * len(tests) < LEVEL]
+    return (
+        f"{compared} rows were measured with two seeds. Each of their {len(tests):,} rates and means was compared:\n"
         "rates by two-proportion tests, means by Welch's t-tests.\n"
-        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}). "
-        + ("These are:\n" if significant else "The smallest p-values are:\n")
-    )
-    lines = [
-        [
-            test.policy,
-            CONDITIONS[test.condition][0],
-            f"`{test.key}`",
-            *(number(test.key, value) for value in test.values),
-            f"{test.p:.2g}",
-            f"{min(test.p * count, 1.0):.2g}",
-        ]
-        for test in significant or tests[:3]
-    ]
-    titles = ("policy", "condition", "metric", "first seed", "second seed", "p", "corrected p")
-    return text + "\n" + markdown(titles, lines)
+        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}).\n"
+    ) + "".join(significant)
 
 
 def pages() -> list[Path]:
