@@ -69,7 +69,8 @@ def main(args: Args) -> dict:
     run = EvaluationRun.from_args("attitude", args, AttitudeEvaluation)
     env = run.env(args.num_turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.settings |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
-    turns, momentum = args.log(run.task, args.stream_seed), MomentumRecorder(env)
+    turns = args.log(run.task, args.stream_seed)
+    momentum = MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
     run.run_episodes(env, turns, film="turn", on_step=momentum)
     values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import open_loop_jump
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jump_metrics import LandingPlayFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep
-from jumper_warp.policies.conditions import Conditions
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.film import write_film
 from support.scripts import DeviceArgs, announce, prepare, report, run_script
 
@@ -52,9 +52,10 @@ def film_jump(args: Args, folder: Path) -> JumpLog:
     return log
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Simulate open-loop jump, paper's tests and filmed jump, print one summary, and return the metrics."""
-    folder, values = prepare("demo", args), {}
+    folder = prepare("demo", args)
+    values = {}
     announce("open-loop jump; the first run compiles kernels for up to a minute")
     (folder / "open_loop").mkdir(exist_ok=True)
     metrics, _ = open_loop_jump.measure(open_loop_jump.Args(device=args.device), folder / "open_loop")

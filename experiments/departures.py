@@ -30,9 +30,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
@@ -41,7 +41,7 @@ from jumper_warp.rl.run_names import newest
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
@@ -64,7 +64,8 @@ def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int)
     The levels are every goal range with each of the last `starts` start height ranges.
     goals [m]: lower and upper point of each range; all other fields are those of the task's last level.
     """
-    last, heights = task.levels[-1], [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
+    last = task.levels[-1]
+    heights = [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
     levels = (replace(last, goal_lower=low, goal_upper=top, base_height=z) for low, top in goals for z in heights)
     return replace(task, levels=tuple(levels))
 
@@ -190,7 +191,7 @@ COLUMNS = {
 }  # fmt: skip
 """Columns of the table: metric and scale; cells are nominal / randomised."""
 WIDTH = 180  # Width of the table in characters
-MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]  # Metrics by training (name, seed), test and name
+MetricsByTraining = dict[tuple[str, int], dict[str, Json]]  # Metrics by training (name, seed), test and name
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ class DepartureCfg:
     """Settings with which the ablations of a task are trained and evaluated."""
 
     iterations: int  # Iterations of each training
-    goals: dict[str, Any]  # [m] Flags that set the goals of the evaluated jumps
+    goals: Json  # [m] Flags that set the goals of the evaluated jumps
     squats: tuple[float, float]  # [m] Range of goals for which squats are held
     begin: str = ""  # Further flags of `jumper train` for every training
 
@@ -225,7 +226,8 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
 
     arguments: of `jumper train`. Raises InputError: the existing training has other settings.
     """
-    recipe, name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    recipe = parse(ablation, arguments)
+    name = f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
     last = name.format(recipe.train.max_iterations)
     if run := newest(path.parents[1] for path in recipe.train.log_root.glob(f"*/*/{last}")):
         config = json.loads((run / CONFIG).read_text())
@@ -239,12 +241,13 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     return result.folder / name.format(result.iteration)
 
 
-def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
+def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, Json]:
     """Evaluate a policy's jumps and held squats: return the scalar metrics by name, for each of TESTS.
 
     args: `Args`; folder: for outputs of the run.
     """
-    run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
+    run = EvaluationRun(checkpoint)
+    ends = make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
     for test, count in zip(TESTS, args.num_jumps, strict=True):
@@ -275,7 +278,7 @@ def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
     plot_results(results, folder / "departures.png")
 
 
-def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
+def cell(tests: dict[str, Json], name: str, scale: float) -> str:
     """Format a metric of nominal and randomised jumps for the table, as `nominal / randomized`, times `scale`.
 
     tests: metrics by test and name.
@@ -343,12 +346,13 @@ class Args(ThreadArgs):
         return [self.task, *shlex.split(flags), "--log-root", str(folder)]
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Train and evaluate each ablation of a jump task, write results as a table and a plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
-    folder, results = prepare("departures", args, args.threads), {}
-    values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
+    folder = prepare("departures", args, args.threads)
+    results = {}
+    values: Json = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
     for name, seed, ablation in tracked([*args.trainings()], "trainings"):
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:

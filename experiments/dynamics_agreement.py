@@ -36,7 +36,8 @@ def random_motors(description: RobotDescription, n: int, rng: np.random.Generato
     Rows: legs FL, FR, BL, BR; each lateral, outer, inner. Outer and inner angles also respect the stops of their sum.
     """
     lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
-    lower, upper = (outer.lower + margin, outer.upper - margin)
+    lower = outer.lower + margin
+    upper = outer.upper - margin
     lateral_angle = rng.uniform(lateral.lower + margin, lateral.upper - margin, (4, 1, n))
     outer_angle = rng.uniform(lower, upper, (4, 1, n))
     lowest = np.maximum(lower, description.transversal_sum[0] + margin - outer_angle)
@@ -84,7 +85,9 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = (np.zeros((n, width)) for width in (43, 38, 38))
     q[:, 3:7], q[:, [1 + dof for dof in MOTOR_DOFS]] = states["quat"], states["angles"]
-    qd[:, :3], qd[:, 3:6], qd[:, MOTOR_DOFS] = states["com_vel"], states["ang_vel"], states["rates"]
+    qd[:, :3] = states["com_vel"]
+    qd[:, 3:6] = states["ang_vel"]
+    qd[:, MOTOR_DOFS] = states["rates"]
     force[:, MOTOR_DOFS] = states["torque"]
 
     def array(rows: np.ndarray) -> wp.array:
@@ -101,7 +104,8 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vectorf, device="cpu"))
     dynamics.advance(DT, 1, drive, *after, *after)
     new_q, new_qd = (rows.numpy().reshape(n, -1) for rows in after)
-    (turn, origin, spin), (_, new_origin, new_spin) = base_velocity(q, qd), base_velocity(new_q, new_qd)
+    (turn, origin, spin) = base_velocity(q, qd)
+    (_, new_origin, new_spin) = base_velocity(new_q, new_qd)
     accelerations = {
         "base_acceleration": turn.inv().apply(new_origin - origin) / DT,
         "base_angular_acceleration": (new_spin - spin) / DT,
@@ -116,11 +120,14 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     Keys: `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad].
     q: joint coordinates (n, 43), whose base orientation is overwritten.
     """
-    n, model = len(q), dynamics.model
+    n = len(q)
+    model = dynamics.model
     q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
     shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
     anchors = np.array([loop.parent_anchor for loop in dynamics.description.loops])
-    arms, paws, columns = anchors - model.body_com.numpy()[shanks], [], []
+    arms = anchors - model.body_com.numpy()[shanks]
+    paws = []
+    columns = []
     for motor in range(3):
         rates = np.zeros((n, 38))
         rates[:, MOTOR_DOFS[motor::3]] = 1.0
@@ -140,7 +147,8 @@ def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
 
     The robot is the first one of `values`. Keys: those of UNITS.
     """
-    robot, rows = build_pinocchio(values=values), []
+    robot = build_pinocchio(values=values)
+    rows = []
     for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
         turn = Rotation.from_quat(quat)
         spin = turn.inv().apply(ang_vel)
@@ -149,8 +157,15 @@ def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
         v = robot.closed_velocity(q, twist, rates)
         acceleration = robot.forward_dynamics(q, v, torque)
         level = robot.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
-        rows.append((acceleration[:3] + np.cross(v[3:6], v[:3]), acceleration[3:6], acceleration[robot.motor_v],
-                     robot.paw_positions(level), robot.paw_jacobians(level)))  # fmt: skip
+        rows.append(
+            (
+                acceleration[:3] + np.cross(v[3:6], v[:3]),
+                acceleration[3:6],
+                acceleration[robot.motor_v],
+                robot.paw_positions(level),
+                robot.paw_jacobians(level),
+            )
+        )
     names = ("base_acceleration", "base_angular_acceleration", "joint_acceleration", "paw_position", "paw_jacobian")
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
@@ -184,7 +199,8 @@ def main(args: Args) -> dict:
     folder = output_dir("dynamics_agreement", args.out)
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
     states = random_states(args.states, args.seed)
-    ours, expected = jumper_quantities(values, states), pinocchio_quantities(values, states)
+    ours = jumper_quantities(values, states)
+    expected = pinocchio_quantities(values, states)
     metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
     for name, unit in UNITS.items():
         difference, relative = differences(ours[name], expected[name])

@@ -16,22 +16,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.conditions import shared_robot
 from jumper_warp.evaluation.jumps import DELAY, jump_commands
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.run import EvaluationArgs, Run, conditions_of
-from jumper_warp.policies.conditions import shared_robot
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 from jumper_warp.utils.rotations import yaw_of
 from jumper_warp.viz.plots import figure
@@ -77,12 +77,16 @@ class FlightLog(EvaluationLog):
         self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum above HIGH
         self.tilts: list[np.ndarray] = []  # [rad] (num_envs,) after every policy step, until the end
         self.heights: list[np.ndarray] = []  # [m] (num_envs,) base height after every policy step
-        self._takeoff_step, self._touchdown_step = np.full(n, -1), np.full(n, -1)
-        self._airborne_steps, self._yaw, self._initial_momentum = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
+        self._takeoff_step = np.full(n, -1)
+        self._touchdown_step = np.full(n, -1)
+        self._airborne_steps = np.zeros(n, dtype=int)
+        self._yaw = np.zeros(n)
+        self._initial_momentum = np.zeros((n, 3))
 
-    def begin(self, env: Any) -> None:
+    def begin(self, env: Env) -> None:
         """Reset every robot to the default pose, with its commanded apex height."""
-        self.step_dt, goals = env.step_dt, np.zeros((len(self.apex), 3))
+        self.step_dt = env.step_dt
+        goals = np.zeros((len(self.apex), 3))
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
@@ -92,7 +96,8 @@ class FlightLog(EvaluationLog):
         The result is (num_envs, 4), legs FL, FR, BL, BR.
         late: the field `late`.
         """
-        step, n = len(self.tilts), len(self.apex)
+        step = len(self.tilts)
+        n = len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
         delay = late @ (0.5 * LEG_SIGNS.T) / self.step_dt  # [policy steps]
         extended = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
@@ -116,13 +121,14 @@ class FlightLog(EvaluationLog):
         action[pushing] = legs.reshape(n, 12)[pushing]
         return action
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the robots' motion, contacts and termination by name for `update`, (num_envs, ...), world axes.
 
         base_pos [m], tilt [rad], turn (size of the yaw [rad]), rise (upward speed [m/s]), spin (angular speed [rad/s]),
         down (whether any paw is on the ground), termination (index), momentum (angular, about the COM [kg m^2/s]).
         """
-        q, qd = env.sim.joint_q(), env.sim.joint_qd()
+        q = env.sim.joint_q()
+        qd = env.sim.joint_qd()
         quat = q[:, 3:7]
         up = 1.0 - 2.0 * (quat[:, 0] ** 2 + quat[:, 1] ** 2)
         forces = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
@@ -130,7 +136,7 @@ class FlightLog(EvaluationLog):
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
                 "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
-    def record_step(self, env: Any) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Record a policy step; return whether all flights have ended.
 
         If `turns`, request the turning skill for robots that took off in this step.
@@ -147,7 +153,8 @@ class FlightLog(EvaluationLog):
 
         A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension.
         """
-        step, running = len(self.tilts), self.end < 0
+        step = len(self.tilts)
+        running = self.end < 0
         self._airborne_steps = np.where(arrays["down"], 0, self._airborne_steps + 1)
         earliest, needed = (0, CLEAR) if self.late is None else (RAMP + HOLD, 1)
         rising = (self._airborne_steps >= needed) & (arrays["rise"] > 0.75) & (step >= earliest)
@@ -202,7 +209,7 @@ class FlightLog(EvaluationLog):
         """Return the last tilt [deg] and base height [m] of all worlds."""
         return {"tilt/of {} [deg]": np.degrees(self.tilts[-1]), "height/base of {} [m]": self.heights[-1]}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return commanded apex heights `asked_m` of some worlds, and `late_ms`, the delays of front and left legs."""
         notes = {"asked_m": self.apex[list(worlds)].tolist()}
         return notes if self.late is None else notes | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
@@ -213,8 +220,11 @@ def flight_metrics(flights: FlightLog) -> Metrics:
 
     Means are over the flights that took off or touched down.
     """
-    up, down, each = "flights that took off", "flights that touched down", "flights"
-    touchdown_tilt, touchdown_turn = np.degrees(flights.touchdown_tilt), np.degrees(flights.touchdown_turn)
+    up = "flights that took off"
+    down = "flights that touched down"
+    each = "flights"
+    touchdown_tilt = np.degrees(flights.touchdown_tilt)
+    touchdown_turn = np.degrees(flights.touchdown_turn)
     error = {"apex_error_abs_mean_m": mean(abs(flights.height - flights.apex), each)}
     return {
         "landed_upright_rate": rate(flights.success, each),
@@ -241,7 +251,8 @@ def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
     They are vectors of length most / 2 to most [s]. A negative delay is one of the back or right legs.
     """
     rng = np.random.default_rng(seed)
-    size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    size = rng.uniform(0.5 * most, most, count)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
@@ -269,8 +280,8 @@ class FlightRun(Run):
         PolicyError or CheckpointError: a policy cannot be used, or its task is another one.
         """
         super().__init__()
-        self.turn: Policy = open_policy(args.policy)
-        self.landing: Policy | None = open_policy(landing) if landing else None
+        self.turn: Policy = Policy.load(args.policy)
+        self.landing: Policy | None = Policy.load(landing) if landing else None
         self.recipes = {"the turning policy": self.turn.recipe()}
         turning = self.recipes["the turning policy"].tested_task(randomize=False)
         if turning.evaluation.kind != "attitude":
@@ -354,7 +365,8 @@ class Args(EvaluationArgs):
 def main(args: Args) -> dict:
     """Simulate the same flights with and without the turning policy, plot tilts and heights, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
-    env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
+    env = run.env(args.num_flights)
+    heights = np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay
     late = extension_delays(args.num_flights, max_delay, args.stream_seed) if args.takeoff == "open-loop" else None
     flights = {

@@ -62,7 +62,9 @@ class RandomEnv:
 
     def __init__(self, num_envs: int, device: torch.device, still: bool = False) -> None:
         """Allocate observations, the critic's observations, rewards and ends of episodes."""
-        self.num_envs, self.device, self.still = num_envs, device, still
+        self.num_envs = num_envs
+        self.device = device
+        self.still = still
         self.obs = self.final_obs = torch.randn(num_envs, self.num_obs, device=device)
         self.critic_obs = self.final_critic_obs = torch.randn(num_envs, self.num_critic_obs, device=device)
         self.reward, self.done, self.timeout = torch.zeros(3, num_envs, device=device)
@@ -118,7 +120,8 @@ def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
     model = copy.deepcopy(ppo.model).double()
     for param in model.parameters():
         param.grad = None
-    mean, value = model.mean(batch.features), model.critic(batch.critic_features)[:, 0]
+    mean = model.mean(batch.features)
+    value = model.critic(batch.critic_features)[:, 0]
     ratio = (gaussian_log_prob(batch.action, mean, model.log_std) - batch.log_prob).exp()
     clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     surrogate = -torch.minimum(batch.advantage * ratio, batch.advantage * clipped).mean()
@@ -153,11 +156,13 @@ def times(ppo: Learner, args: Args) -> dict[str, float]:
         ppo.iterate()
     parts: dict[str, Callable[[], object]] = {"collect": ppo.collect, "update": ppo.update}
     if ppo.cfg.fused:
-        fused, samples = cast("FusedPpo", ppo), ppo.order()[: ppo.batch_size // ppo.cfg.minibatches].clone()
+        fused = cast("FusedPpo", ppo)
+        samples = ppo.order()[: ppo.batch_size // ppo.cfg.minibatches].clone()
         rollout = fused.rollout
         parts |= {"gradient": lambda: fused.fused.compute_gradient(samples), "adam": fused.fused.update_parameters}
         for name, features in (("actor", rollout.features), ("critic", rollout.critic_features)):
-            network, work = getattr(fused.networks, name), (features.flatten(0, 1), len(samples), samples)
+            network = getattr(fused.networks, name)
+            work = (features.flatten(0, 1), len(samples), samples)
             parts |= {f"{name}_forward": partial(network.forward, *work)}
             parts |= {f"{name}_backward": partial(network.backward, *work)}
     values = {}

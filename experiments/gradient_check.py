@@ -35,7 +35,8 @@ class Ascent:
 def ascend(device: str | None) -> Ascent:
     """Raise the apex of a jump with a weak push-off by ASCENT_STEPS normalised gradient steps on all motor targets."""
     jump = GradientJump(1, double=False, device=device)
-    targets, heights = schedule(WEAK_PUSH), []
+    targets = schedule(WEAK_PUSH)
+    heights = []
     for _ in range(ASCENT_STEPS):
         rollout, grads = jump.gradients({"targets": targets})
         heights.append(float(apex(rollout)[0]))

@@ -38,8 +38,10 @@ class PlainJump:
 
         targets: motor targets [rad], (steps, 12).
         """
-        self._rollout, n = rollout, rollout.num_worlds
-        dynamics, modules = rollout.dynamics, rollout.dynamics.modules
+        self._rollout = rollout
+        n = rollout.num_worlds
+        dynamics = rollout.dynamics
+        modules = rollout.dynamics.modules
         self._start = [rollout.array(np.tile(values, n)) for values in start()]
         self._q, self._qd = (wp.clone(array) for array in self._start)
         self._targets = rollout.array(np.repeat(targets[:, :, None], n, axis=2))
@@ -56,16 +58,20 @@ class PlainJump:
                 wp.copy(current, initial)
             for target in (self._targets[step] for step in range(len(targets))):
                 wp.launch(
-                    modules.command_filter.command_filter_kernel, dim=(4, n), device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[filtered],
-                )  # fmt: skip
+                    modules.command_filter.command_filter_kernel,
+                    dim=(4, n),
+                    device=rollout.device,
+                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits],
+                    outputs=[filtered],
+                )
                 dynamics.advance(PHYSICS_DT, SUBSTEPS, drive, self._q, self._qd, self._q, self._qd)
 
         run()
         with wp.ScopedCapture(device=rollout.device) as capture:
             run()
         assert capture.graph is not None
-        self._graph, self._arrays = capture.graph, (drive, filtered, wrench)  # a graph on a GPU keeps no arrays alive
+        self._graph = capture.graph
+        self._arrays = (drive, filtered, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:
         """Simulate the jump by replaying the graph."""
@@ -120,7 +126,8 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Time a jump's simulation and gradient, compare the gradient with double precision, return the metrics."""
-    name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
+    name = configure_device(args.device, 1).name
+    device = wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.num_envs or (4096 if device.is_cuda else 64)
     exact = GradientRun(1, True, args.device).run()

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from jumper_warp.identification.recording import KINDS, measure, replay_plan, sa
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.results import CONFIDENCE, Identification
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
@@ -86,18 +86,20 @@ def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Ge
     return float(1.0 - is_good(np.abs(errors / result.std)[:, result.identified]).mean())
 
 
-def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]:
+def identify_far_robot(stream: Stream, robot: int, noise: int) -> Json:
     """Sample a robot, record its motions, identify it on one CPU thread, and return the result as JSON data.
 
     robot, noise: indices of the robot with its motions, and of the noise of its sensors and scale.
     """
     configure_device("cpu", 1)
-    parameters, replay = jumper_parameters(), MotionReplay(device="cpu", threads=1)
+    parameters = jumper_parameters()
+    replay = MotionReplay(device="cpu", threads=1)
     rng, noise_rng = (
         np.random.default_rng(seed) for seed in ([STREAMS[stream], robot], [STREAMS[stream], robot, 1 + noise])
     )
     truth = far_robot(parameters, rng)
-    robots, described = parameters.robots(truth), parameters.robots(np.zeros_like(truth))
+    robots = parameters.robots(truth)
+    described = parameters.robots(np.zeros_like(truth))
     simulate = partial(replay_plan, MotionReplay(device="cpu", threads=1))
     motions = []
     while len(motions) < len(KINDS):
@@ -109,7 +111,8 @@ def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]
     mass = weighed_mass(float(total_mass(robots)[0]) + SCALE_STD * mass_error, SCALE_STD)
     result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
     error = np.abs(result.z - truth)[result.identified] / result.std[result.identified]
-    outside, worst = int((error > CONFIDENCE).sum()), float(error.max())
+    outside = int((error > CONFIDENCE).sum())
+    worst = float(error.max())
     names = np.array(parameters.names)[result.identified]
     return {
         "robot": robot, "noise": noise, "consistent": result.consistent, "inconsistency": result.inconsistency,
@@ -149,7 +152,7 @@ class Args(OutputArgs):
             raise InputError(f"shard must be K/N with K in 1 to N, such as 2/3, got {self.shard:.20}")
 
 
-def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
+def saved_fits(path: Path) -> dict[tuple[int, int], Json]:
     """Return the fits in a file of JSON lines by (index of robot, index of noise); a last line cut short is dropped."""
     fits = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
@@ -161,7 +164,7 @@ def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
     return fits
 
 
-def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(fits: list[Json]) -> Json:
     """Return metrics of all fits: numbers of accepted (consistent) and good ones, interval coverage, and CPU time."""
     accepted, good = ([fit for fit in fits if fit[name]] for name in ("consistent", "good"))
     bad = [fit for fit in accepted if not fit["good"]]
@@ -188,7 +191,7 @@ def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Compute the fits that are missing in the output folder, and write and return the metrics of all fits."""
     folder = output_dir("identification_starts", args.out)
     path = folder / f"{args.stream}.jsonl"

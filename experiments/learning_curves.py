@@ -19,13 +19,13 @@ import itertools
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any
 
 import warp as wp
 
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_RANGES, LearningCurve, compare, curve_metrics, plot_curves, train_and_time
 from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
@@ -78,11 +78,11 @@ def train_in_process(args: Args, name: str, seed: int) -> LearningCurve:
         return pool.submit(train, args, name, seed).result()
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Train every variant with every seed, write metrics and plot after each, and return the metrics."""
     folder = prepare("learning_curves", args)
     length = {"iterations": args.iterations} if args.iterations else {"seconds": args.seconds}
-    values: dict[str, Any] = {"task": args.task, **length, "envs": args.num_envs, "randomize": args.randomize}
+    values: Json = {"task": args.task, **length, "envs": args.num_envs, "randomize": args.randomize}
     limits = args.goal_range or TEST_RANGES[make_task(args.task).evaluation.kind]
     values |= {"seeds": list(args.seeds), "goals_m": list(limits), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}

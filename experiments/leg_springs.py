@@ -25,6 +25,7 @@ from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
 from support.scripts import DeviceArgs, prepare, report, run_script
@@ -45,8 +46,15 @@ class SpringJumps:
 
     def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:
         """Return a simulation of `count` robots; robot: their parameters; settings: more arguments of `Simulation`."""
-        return Simulation(count, motors=self.motors, command_filter=FILTERS[self.filter](), gravity=self.gravity,
-                          robot=robot, device=self.device, **settings)  # fmt: skip
+        return Simulation(
+            count,
+            motors=self.motors,
+            command_filter=FILTERS[self.filter](),
+            gravity=self.gravity,
+            robot=robot,
+            device=self.device,
+            **settings,
+        )
 
     def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
         """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).
@@ -58,7 +66,8 @@ class SpringJumps:
         robots.spring_stiffness[:, 0] = np.repeat(stiffness, shape[1])
         robots.spring_length[:, 0] = self.length
         sim = self.simulation(shape[0] * shape[1], robots, visuals=False)
-        apex, extend_step = np.zeros(sim.num_worlds), STAND + RAMP + HOLD
+        apex = np.zeros(sim.num_worlds)
+        extend_step = STAND + RAMP + HOLD
         for tick in range(extend_step + EXTEND + FALLING):
             commands = [transversal_command(min(tick, extend_step + EXTEND - 1), squat) for squat in squats]
             sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
@@ -109,7 +118,7 @@ class Args(DeviceArgs):
 def main(args: Args) -> dict:
     """Simulate a jump for each spring stiffness and squat angle, plot the best apexes, and return the metrics."""
     folder = prepare("leg_springs", args)
-    values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
+    values: Json = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     title = f"Open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
@@ -117,7 +126,8 @@ def main(args: Args) -> dict:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
             apexes = jumps.apexes(args.stiffness, args.squat_angles)
-            best, top = apexes.max(axis=1), int(apexes.max(axis=1).argmax())
+            best = apexes.max(axis=1)
+            top = int(apexes.max(axis=1).argmax())
             squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
                        f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip

@@ -27,14 +27,15 @@ import tyro
 
 from jumper_warp.evaluation.attitude import AttitudeFlags
 from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jump_metrics import JumpFlags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import read_values
 from support.policy_results import (
     COMBINED,
@@ -139,21 +140,27 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
         for policy in args.policies
         for condition in args.conditions
         for seed in (args.seeds[:1] if condition in TESTS else args.seeds)
-        if (policy in TESTS[condition]["policies"] if condition in TESTS
-            else policy in tasks and undefined(tasks[policy], condition) is None)
-    ]  # fmt: skip
+        if (
+            policy in TESTS[condition]["policies"]
+            if condition in TESTS
+            else policy in tasks and undefined(tasks[policy], condition) is None
+        )
+    ]
     return [row for row in defined if not (args.row(*row) / METRICS).is_file()]
 
 
-def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str, Any]:
+def measure_row(args: Args, policy: str, condition: str, seed: int) -> Json:
     """Evaluate a policy in one condition, write its metrics.json, and return conditions and metrics by name."""
     if condition in TESTS:
         flags = ["--seed", str(seed), *(["--device", args.device] if args.device else [])]
         run_test(policy, condition, args.row(policy, condition, seed), flags)
         return read_values(args.row(policy, condition, seed))
-    run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition][1])
+    run = EvaluationRun(policy)
+    folder = args.row(policy, condition, seed)
+    values = dict(CONDITIONS[condition][1])
     if payload := values.pop("payload", None):
-        run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
+        run.settings["payload_kg"] = payload
+        values["robot"] = folder / "payload.json"
         folder.mkdir(parents=True, exist_ok=True)
         payload_overlay(run.recipe.robot, payload).save(values["robot"])
     conditions = Conditions(**values, seed=seed, device=args.device, threads=args.threads)

@@ -53,8 +53,15 @@ def main(args: Args) -> dict:
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
     ppo = PpoCfg(num_steps=args.num_steps)
-    cfg = TrainCfg(num_envs=args.num_envs, max_iterations=args.iterations, log_interval=1, log_root=folder / "logs",
-                   ppo=ppo, device=args.device, tensorboard=False)  # fmt: skip
+    cfg = TrainCfg(
+        num_envs=args.num_envs,
+        max_iterations=args.iterations,
+        log_interval=1,
+        log_root=folder / "logs",
+        ppo=ppo,
+        device=args.device,
+        tensorboard=False,
+    )
     result = train(Recipe(TASK, cfg))
     values = {
         "episode_reward_even_load": result.metrics["Episode_Reward/even_load"],

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.gravity import EARTH
@@ -25,6 +25,7 @@ from jumper_warp.robot.overlay import RobotOverlay, load_overlay, with_springs
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
 from support.scripts import DeviceArgs, prepare, report, run_script
 
@@ -56,7 +57,7 @@ def factor_of(robot: RobotOverlay | None, name: str) -> float:
     return 1.0 if robot is None else float(getattr(robot.robots(), name)[0, list(TRANSVERSAL)].min())
 
 
-def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
+def measure(args: Args, folder: Path) -> tuple[Json, str]:
     """Simulate the open-loop jump, write its plots and recording into a folder, return metrics and a title."""
     robot = None if args.robot is None else load_overlay(args.robot)
     limit, kp = (value * factor_of(robot, name) for name, value in (("saturation", args.torque_limit), ("kp", args.kp)))
@@ -71,11 +72,16 @@ def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
     motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
     command_filter = loose_filter() if args.loose else vertical_jump_filter()
     sim = Simulation(
-        1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
+        1,
+        solver=args.solver,
+        motors=motors,
+        command_filter=command_filter,
+        gravity=args.gravity,
+        robot=robot,
         device=args.device,
-    )  # fmt: skip
+    )
     trace, recorder = simulate_jump(sim, variant, args.squat_angle)
-    values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
+    values: Json = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     words = [SOLVER_TITLES[args.solver], f"{limit:.4g} N m", f"kp {kp:.4g} N m/rad"]

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import suites_for
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics
 from jumper_warp.utils.output import output_dir, read_values
 from support.scripts import report, run_script
@@ -36,13 +36,14 @@ def main(args: Args) -> dict:
 
     Keys: `<policy>_<suite>_<key>`.
     """
-    folder, paper = output_dir("paper_tests", args.out), {}
+    folder = output_dir("paper_tests", args.out)
+    paper = {}
     metrics: Metrics = {}
     for policy in args.policies:
         for name, suite in suites_for(EvaluationRun(policy).task).items():
             if not suite.paper:
                 continue
-            flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}
+            flags: Json = {key: value for key, value in asdict(args).items() if key != "policies"}
             prefix = f"{Path(policy).name}_{name}"
             run, values = suite(**flags | {"policy": policy, "out": folder / prefix}).evaluate()
             run.write(values)

@@ -26,20 +26,21 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.suites import Grid
 from jumper_warp.evaluation.velocities import SLEW_RATE, VELOCITY_METRICS, VelocityLog
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, measure
 from jumper_warp.utils.output import read_values, write_metrics
 from jumper_warp.viz.plots import figure
@@ -137,7 +138,8 @@ def metrics_of(run: EvaluationRun, log: EvaluationLog) -> Metrics:
 
 def evaluate_arm(checkpoint: Path, folder: Path, num_jumps: int, conditions: Conditions) -> Metrics:
     """Run the paper's tests of a policy on nominal and noisy, randomised robots; keys: `<robots>_<test>_<metric>`."""
-    run, metrics = EvaluationRun(checkpoint), {}
+    run = EvaluationRun(checkpoint)
+    metrics = {}
     run.prepare("paper_trainings", conditions, folder)
     for robots in (NOMINAL, RANDOMIZED):
         drawn = robots == RANDOMIZED
@@ -160,7 +162,8 @@ def learning_curve(run_folder: Path, num_jumps: int, conditions: Conditions) -> 
     key = PRIMARY[run.evaluation.kind].removeprefix(f"{test}_")
     curve: dict[str, list[float]] = {"iterations": [], "values": []}
     for checkpoint in checkpoints:
-        policy, log = open_policy(checkpoint), make_log(env.task, test, num_jumps)
+        policy = Policy.load(checkpoint)
+        log = make_log(env.task, test, num_jumps)
         policy.to(env.device)
         run_evaluation(policy.act, env, log)
         curve["iterations"].append(int(checkpoint.stem.removeprefix("iteration_")))
@@ -205,7 +208,7 @@ CURVES = (
 """Task, label of the primary metric and the paper's value of each plot of `plot_curves`."""
 
 
-def finished(folder: Path, task: str, arm: str) -> list[dict[str, Any]]:
+def finished(folder: Path, task: str, arm: str) -> list[Json]:
     """Return the metrics of all finished trainings of a task with an ablation (arm), one dict per seed."""
     files = sorted((folder / task).glob(f"{arm}_*/metrics.json"))
     return [values for path in files if "curve_steps" in (values := read_values(path.parent))]
@@ -290,7 +293,7 @@ class Args(ThreadArgs):
                 "--log-root", str(folder)]  # fmt: skip
 
 
-def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[str, Any]:
+def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> Json:
     """Train and test a task with an ablation (arm) and a seed, unless `folder` has the results; return them by name."""
     primary = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation.kind]}"
     jumps = not primary.startswith(f"{NOMINAL}_walk")
@@ -298,14 +301,14 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
         return values
     folder.mkdir(parents=True, exist_ok=True)
     command = args.command(name, arm, seed, folder / "runs")
-    plan: dict[str, Any] = {"task": name, "arm": arm, "seed": seed, "flags": shlex.join(command[1:-2])}
+    plan: Json = {"task": name, "arm": arm, "seed": seed, "flags": shlex.join(command[1:-2])}
     plan["primary"] = [primary, STEPS] if jumps else [primary]
     write_metrics(folder, dict.fromkeys(plan["primary"]), plan)
     run, samples = train_arm(command)
     conditions = Conditions(device=args.device, threads=args.threads)
     curve = learning_curve(run, args.num_jumps, conditions)
     steps = [samples * iteration for iteration in curve["iterations"]]
-    values: dict[str, Any] = {"curve_steps": steps, "curve_values": curve["values"], **training_metrics(run)}
+    values: Json = {"curve_steps": steps, "curve_values": curve["values"], **training_metrics(run)}
     if jumps:
         reached = (step for step, value in zip(steps, curve["values"], strict=True) if value >= RATE)
         values[STEPS] = next(reached, None)
@@ -315,9 +318,10 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
     return read_values(folder)
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Run and test all trainings in turn, print a table, plot learning curves; return the primary metric of each."""
-    folder, results = prepare("paper_trainings", args, args.threads), {}
+    folder = prepare("paper_trainings", args, args.threads)
+    results = {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")
         key = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation.kind]}"

@@ -12,10 +12,10 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import scipy.stats
 
 from jumper_warp.evaluation.attitude import TURN_METRICS
@@ -24,13 +24,13 @@ from jumper_warp.evaluation.velocities import VELOCITY_METRICS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.metrics import MetricValue, Z, unit_of
 from support.policy_results import CONDITIONS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
 from support.scripts import run_script
 
 BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. ]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
-TABLES: dict[str, dict[str, Any]] = PAGES["tables"]  # Tables of tests by name
+TABLES: dict[str, Json] = PAGES["tables"]  # Tables of tests by name
 SHOWN = {"nominal": "nominal", "randomised": "randomised", "mujoco": "SolverMuJoCo", "friction_0.4": "friction 0.4"}
 """Conditions in a policy's main table, and their titles there."""
 SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
@@ -57,8 +57,10 @@ def published(task: TaskCfg) -> list[tuple[str, Results]]:
     evaluation = task.evaluation
     kind = evaluation.kind if evaluation == type(evaluation)() else ""  # else other tests than the published ones
     known = [(SIMULATION[kind], evaluation.paper)] if kind in SIMULATION else []
-    return [(words, {key: MetricValue(value) for key, value in values.items()})
-            for words, values in (*known, *PAGES["robot"].get(kind, ()))]  # fmt: skip
+    return [
+        (words, {key: MetricValue(value) for key, value in values.items()})
+        for words, values in (*known, *PAGES["robot"].get(kind, ()))
+    ]
 
 
 def kind_of(task: TaskCfg) -> str:
@@ -70,7 +72,8 @@ def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
     """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
     if pair := values.get("trained_range_m"):
         levels: Any = task.levels
-        aside, back = max(level.goal_upper[1] for level in levels), -min(level.goal_lower[0] for level in levels)
+        aside = max(level.goal_upper[1] for level in levels)
+        back = -min(level.goal_lower[0] for level in levels)
         if kind_of(task) == "height":
             return "{:g} to {:g} m".format(*pair)
         if back > 0.0:
@@ -95,7 +98,8 @@ def number(key: str, value: Any) -> str:
 
 def cell(column: Sequence[str], metrics: Results) -> str:
     """Format a cell of a table, empty if the metrics lack all keys; column: title and keys, ± adds the interval."""
-    text, interval = [], None
+    text = []
+    interval = None
     for key in column[1:]:
         if metric := metrics.get(key.removeprefix("±")):
             text.append(number(key, metric.value))
@@ -122,11 +126,13 @@ def first_seed(policy: str) -> dict[str, Row]:
 
 def main_table(policy: str, task: TaskCfg) -> str:
     """Return the main table of a policy: metrics as rows, conditions and published results as columns."""
-    rows, paper = first_seed(policy), published(task)
+    rows = first_seed(policy)
+    paper = published(task)
     single = [(title, rows[name].metrics) for name, title in SHOWN.items() if name in rows]
     single += [(words, metrics) for words, metrics in paper if not words.startswith(ON_ROBOT)]
     robot = {words.removeprefix(ON_ROBOT): metrics for words, metrics in paper if words.startswith(ON_ROBOT)}
-    titles, together = [title for title, _ in single], ON_ROBOT.strip(", ")
+    titles = [title for title, _ in single]
+    together = ON_ROBOT.strip(", ")
     lines = []
     for line in PAGES["main"][kind_of(task)]:
         cells = [line[0], *(cell(line, metrics) for _, metrics in single)]
@@ -142,14 +148,18 @@ def main_table(policy: str, task: TaskCfg) -> str:
 
 def all_conditions(policy: str, task: TaskCfg) -> str:
     """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
-    rows, wide = first_seed(policy), PAGES["wide"][kind_of(task)]
+    rows = first_seed(policy)
+    wide = PAGES["wide"][kind_of(task)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
     nominal = rows["nominal"]
     note = f"{trials_of(nominal)} trials a row; commands: {nominal.values['commands']}.\n"
     note += f"Trained on {trained_on(task, nominal.values)}.\n"
-    reasons = [f"Not measured: {title}, since {reason}.\n"
-               for name, (title, _) in CONDITIONS.items() if (reason := undefined(task, name))]  # fmt: skip
+    reasons = [
+        f"Not measured: {title}, since {reason}.\n"
+        for name, (title, _) in CONDITIONS.items()
+        if (reason := undefined(task, name))
+    ]
     return "\n".join([markdown(["condition", *(column[0] for column in wide)], lines), note, *reasons])
 
 
@@ -170,8 +180,15 @@ def test_table(name: str) -> str:
 
 def key_table(name: str) -> str:
     """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
-    lines = [[f"`{metric.key}`", "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
-              metric.statistic.__name__, metric.over] for metric in KEYS[name]]  # fmt: skip
+    lines = [
+        [
+            f"`{metric.key}`",
+            "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
+            metric.statistic.__name__,
+            metric.over,
+        ]
+        for metric in KEYS[name]
+    ]
     return markdown(("key", "unit", "statistic", "over"), lines)
 
 
@@ -179,9 +196,12 @@ def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
     """Return a Markdown table with a policy for each need: tested and trained commands, success, error, limits."""
     lines = []
     for need in PAGES["needs"]:
-        policy, tests = need["policy"], need.get("tests", ("nominal", "randomised", "friction_0.4"))
-        rows, task = first_seed(policy), tasks[policy]
-        page, values = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)], rows[tests[0]].values
+        policy = need["policy"]
+        tests = need.get("tests", ("nominal", "randomised", "friction_0.4"))
+        rows = first_seed(policy)
+        task = tasks[policy]
+        page = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)]
+        values = rows[tests[0]].values
         speed = values.get("speed_m_s")
         tested = str(values["commands"]) if speed is None else f"bumps, slopes, steps at {speed} m/s"
         cells = [_success(rows[test], kind_of(task)) if test in rows else "" for test in tests]
@@ -197,21 +217,13 @@ def _success(row: Row, kind: str) -> str:
         rates = [metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate")]
         parts = [f"{number('fall_rate', max(rate for rate in rates if isinstance(rate, float)))} fall"]
     else:
-        rate, (key, factor, text) = RATES.get(kind, "success_rate"), ERRORS[kind]
-        share, error = number(rate, row.metrics[rate].value).replace("100.0", "100"), row.metrics[key].value
+        rate = RATES.get(kind, "success_rate")
+        (key, factor, text) = ERRORS[kind]
+        share = number(rate, row.metrics[rate].value).replace("100.0", "100")
+        error = row.metrics[key].value
         assert isinstance(error, float)
         parts = [share + " fall" * (kind == "velocity"), text.format(factor * error)]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
-
-
-class SeedTest(NamedTuple):
-    """Significance test of the difference of one metric between two seeds."""
-
-    policy: str
-    condition: str
-    key: str
-    values: tuple[Any, Any]
-    p: float  # Two-sided
 
 
 def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
@@ -220,54 +232,48 @@ def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
     Rates are compared by the two-proportion test with pooled variance, means by Welch's t-test, whose standard errors
     follow from the 95 % intervals.
     """
-    (p, n), (q, m) = ((float(x.value), int(x.trials or 0)) for x in (a, b))  # pyright: ignore[reportArgumentType]
+    counts = [int(x.trials or 0) for x in (a, b)]
+    values = [float(x.value) for x in (a, b)]  # pyright: ignore[reportArgumentType]
     if key.endswith("_rate"):
-        pooled = (p * n + q * m) / (n + m)
-        v, w, survival = pooled * (1.0 - pooled) / n, pooled * (1.0 - pooled) / m, scipy.stats.norm.sf
-    else:
-        v, w = (((x.interval[1] - x.interval[0]) / (2.0 * Z)) ** 2 if x.interval else 0.0 for x in (a, b))
-        freedom = (v + w) ** 2 / max(v**2 / (n - 1) + w**2 / (m - 1), 1.0e-300)
-        survival = partial(scipy.stats.t.sf, df=freedom)
-    if v + w == 0.0:
-        return 1.0 if p == q else 0.0
-    return 2.0 * float(survival(abs(p - q) / math.sqrt(v + w)))
+        table = [[value * n, (1.0 - value) * n] for value, n in zip(values, counts, strict=True)]
+        if 0.0 in np.sum(table, axis=0):  # all true or all false
+            return 1.0
+        _, p, *_ = scipy.stats.chi2_contingency(table, correction=False)
+        return float(p)  # pyright: ignore[reportArgumentType]
+    stds = [math.sqrt(n) * np.ptp(x.interval or 0.0) / (2.0 * Z) for x, n in zip((a, b), counts, strict=True)]
+    if not any(stds):
+        return 1.0 if values[0] == values[1] else 0.0
+    samples = [x for sample in zip(values, stds, counts, strict=True) for x in sample]
+    return float(scipy.stats.ttest_ind_from_stats(*samples, equal_var=False).pvalue)
 
 
-def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
-    """Test every metric for a difference between the first two seeds of each policy and condition.
+def seed_tests(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
+    """Return the p-value of the difference of each metric between the first two seeds, by policy, condition and key.
 
     Metrics without an interval or with fewer than LEAST trials are left out.
     """
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         pairs.setdefault(row[:2], []).append(row)
-    tests = []
+    tests = {}
     for (policy, condition), (first, *others) in pairs.items():
         for key, a in first.metrics.items() if others else ():
             b = others[0].metrics.get(key, MetricValue(None))
             if a.interval and b.interval and min(a.trials or 0, b.trials or 0) >= LEAST:
-                tests.append(SeedTest(policy, condition, key, (a.value, b.value), difference_p(key, a, b)))
+                tests[policy, condition, key] = difference_p(key, a, b)
     return tests
 
 
 def seed_section(rows: Sequence[Row]) -> str:
     """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
-    tests = sorted(seed_tests(rows), key=lambda test: test.p)
-    count, compared = len(tests), len({test[:2] for test in tests})
-    significant = [test for test in tests if test.p * count < LEVEL]
-    text = (
-        f"{compared} rows were measured with two seeds. Each of their {count:,} rates and means was compared:\n"
+    tests = seed_tests(rows)
+    compared = len({names[:2] for names in tests})
+    significant = [f"- {', '.join(names)}: p = {p:.2g}\n" for names, p in tests.items() if p * len(tests) < LEVEL]
+    return (
+        f"{compared} rows were measured with two seeds. Each of their {len(tests):,} rates and means was compared:\n"
         "rates by two-proportion tests, means by Welch's t-tests.\n"
-        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}). "
-        + ("These are:\n" if significant else "The smallest p-values are:\n")
-    )
-    lines = [
-        [test.policy, CONDITIONS[test.condition][0], f"`{test.key}`",
-         *(number(test.key, value) for value in test.values), f"{test.p:.2g}", f"{min(test.p * count, 1.0):.2g}"]
-        for test in significant or tests[:3]
-    ]  # fmt: skip
-    titles = ("policy", "condition", "metric", "first seed", "second seed", "p", "corrected p")
-    return text + "\n" + markdown(titles, lines)
+        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}).\n"
+    ) + "".join(significant)
 
 
 def pages() -> list[Path]:
@@ -304,7 +310,8 @@ class Args:
 
 def main(_: Args) -> int:
     """Make the tables of all pages, print the paths of the pages that changed, and return their number."""
-    tasks, changed = tasks_of(policy_tasks()), []
+    tasks = tasks_of(policy_tasks())
+    changed = []
     for path in pages():
         old = path.read_text(encoding="utf-8")
         if (new := filled(old, tasks)) != old:

@@ -28,7 +28,8 @@ def main(args: Args) -> dict:
     """Run jumps with each friction, plot their mean error over friction, and return the metrics."""
     run = EvaluationRun.from_args("template", args)  # the setting: policy, task, device, output folder
     flags = LandingFlags(args.num_jumps)  # goals as in `jumper evaluate`
-    metrics, errors = {}, []
+    metrics = {}
+    errors = []
     for friction in args.frictions:
         env = run.env(args.num_jumps, conditions=replace(run.conditions, friction=friction))
         log = run.run_episodes(env, flags.log(env.task, args.stream_seed), film=f"friction_{friction:g}")

@@ -58,6 +58,7 @@ from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
 from jumper_warp.utils.arrays import write_npz
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
@@ -77,7 +78,7 @@ class MotionReplay:
     all motors) [W], angle (n, 12) [rad], torque (n, 12) [N m]. `_evaluate` documents the results.
     """
 
-    def __init__(self, targets: np.ndarray, problem: Problem, *, notes: dict[str, Any] | None = None) -> None:
+    def __init__(self, targets: np.ndarray, problem: Problem, *, notes: Json | None = None) -> None:
         """Simulate motor targets [rad], (policy steps, 12), from standing, with the robot and ground of a problem.
 
         notes: JSON metadata of the recording.
@@ -85,13 +86,21 @@ class MotionReplay:
         from jumper_warp.viz.recorder import Recorder
 
         self.problem = problem
-        self.sim = Simulation(1, motors=problem.motors, command_filter=problem.command_filter,
-                              friction=problem.friction, gravity=problem.gravity, device=problem.device)  # fmt: skip
-        self.targets, self.recorder = targets, Recorder(self.sim.model, notes=notes)
+        self.sim = Simulation(
+            1,
+            motors=problem.motors,
+            command_filter=problem.command_filter,
+            friction=problem.friction,
+            gravity=problem.gravity,
+            device=problem.device,
+        )
+        self.targets = targets
+        self.recorder = Recorder(self.sim.model, notes=notes)
         rows: list[tuple] = []
         self.states = [compact(self.sim.joint_q(), self.sim.joint_qd())]
         self.impulses: list[np.ndarray] = []
-        self.flags, self.work = 0, 0.0
+        self.flags = 0
+        self.work = 0.0
         for target in targets:
             self.sim.set_targets(target)
             self.sim.filter_targets()
@@ -99,8 +108,9 @@ class MotionReplay:
                 rows.append(self._physics_step(len(rows)))
             self._record(rows[-1])
         columns = (np.array(column) for column in zip(*rows, strict=True))
-        (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle,
-         self.torque) = columns  # fmt: skip
+        (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle, self.torque) = (
+            columns
+        )
         self._evaluate()
 
     def _physics_step(self, number: int) -> tuple:
@@ -111,7 +121,8 @@ class MotionReplay:
         sim = self.sim
         before = motor_values(sim.joint_qd()[0, 6:])
         sim.physics_step()
-        q, qd = sim.joint_q()[0], sim.joint_qd()[0]
+        q = sim.joint_q()[0]
+        qd = sim.joint_qd()[0]
         torque = sim.torque.numpy()[:, 0].copy()
         power = torque * 0.5 * (before + motor_values(qd[6:]))
         self.impulses.append(sim.dt * sim.paw_force.numpy())
@@ -132,12 +143,16 @@ class MotionReplay:
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
         self.states.append(compact(sim.joint_q(), sim.joint_qd()))
-        flags, clearance = wp.zeros(1, dtype=int, device=sim.device), wp.zeros(1, dtype=float, device=sim.device)
+        flags = wp.zeros(1, dtype=int, device=sim.device)
+        clearance = wp.zeros(1, dtype=float, device=sim.device)
         robot = sim.dynamics.robot
         wp.launch(
-            collision_kernel, dim=1, inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
-            outputs=[flags, clearance], device=sim.device,
-        )  # fmt: skip
+            collision_kernel,
+            dim=1,
+            inputs=[robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0],
+            outputs=[flags, clearance],
+            device=sim.device,
+        )
         self.flags |= int(flags.numpy()[0])
         series = {"base/height [m]": row[1], "base/vertical speed [m s⁻¹]": row[2]}
         for i, name in enumerate(MOTOR_JOINTS):
@@ -160,7 +175,9 @@ class MotionReplay:
         ups = np.diff(self.up[ticks][max(self.takeoff - 1, 0) :], prepend=self.up[ticks][max(self.takeoff - 1, 0)])
         self.hardest = float(ups.max() / (self.sim.substeps * self.sim.dt * EARTH))
         """[g] Largest upward acceleration of the base over a policy step after takeoff, g of Earth."""
-        self.longest_lift, self.highest_lift, self.touched = 0.0, 0.0, 0
+        self.longest_lift = 0.0
+        self.highest_lift = 0.0
+        self.touched = 0
         """[s] and [m] Longest time and largest height of a paw lifted after touchdown; number of paws that touched."""
         for leg in range(4):
             later = np.flatnonzero(down[first:, leg])
@@ -177,8 +194,9 @@ class MotionReplay:
         q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
         parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
         device = str(self.problem.rollout(1).device)
-        return self.problem.motion_of(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
-                                                       for x in parts)))  # fmt: skip
+        return self.problem.motion_of(
+            TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device) for x in parts))
+        )
 
     @property
     def violation(self) -> float:
@@ -186,7 +204,7 @@ class MotionReplay:
         constraints = self.problem.values(self.motion).constraints
         return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Json:
         """Return the metrics of the jump, with units at the end of the names; `collisions`: bit flags of contacts."""
         return {
             "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
@@ -233,8 +251,10 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 
     The extension begins around step `push`, separately for front and hind legs; left and right are equal.
     """
-    shape, step = (count, 1, 4), np.array(knots.at)[None, :, None]
-    first, second = rng.uniform(-1.0, 1.0, shape), rng.uniform(-0.2, 1.0, shape)
+    shape = (count, 1, 4)
+    step = np.array(knots.at)[None, :, None]
+    first = rng.uniform(-1.0, 1.0, shape)
+    second = rng.uniform(-0.2, 1.0, shape)
     switch_step = rng.uniform(8.0, push - 4.0, (count, 1, 1))
     extend_step = np.repeat(rng.uniform(push - 8.0, push + 8.0, (count, 1, 2)), 2, axis=2)
     return np.where(step < extend_step, np.where(step < switch_step, first, second), -1.0).reshape(count, -1)
@@ -246,7 +266,8 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
     The robot leans back, falls forward, crouches, extends the hind legs, then the front legs. Postures scatter around
     POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
-    step, shape = np.array(knots.at)[None, :, None], (count, 1, 1)
+    step = np.array(knots.at)[None, :, None]
+    shape = (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
     hind = rng.uniform(push - 5.0, push + 3.0, shape)
     front = hind + rng.uniform(0.0, 4.0, shape)
@@ -308,9 +329,15 @@ def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
 
 
 def _far(
-    lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
-    command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
-) -> Problem:  # fmt: skip
+    lean: float = 0.0,
+    *,
+    torque: float = 18.0,
+    speed: float = 1.0,
+    pitch: float = PITCH,
+    away: float = AWAY,
+    command_filter: Callable[[], FilterCfg] = horizontal_jump_filter,
+    **settings: Any,
+) -> Problem:
     """Return the optimisation problem of the farthest flight.
 
     lean [1]: weight of leaning back before it, up to BACK; torque [N m] and speed [1]: as for `motors_of`; pitch [rad],
@@ -320,7 +347,8 @@ def _far(
         jumps.landing_pitch(pitch), jumps.stays(away, TAKEOFF_SPEED), jumps.clear(speed=TAKEOFF_SPEED),
         jumps.no_run_up(AHEAD), jumps.takes_off(TAKEOFF_SPEED),
     )  # fmt: skip
-    far, back = jumps.farthest(TAKEOFF_SPEED), jumps.leans_back(BACK, TAKEOFF_SPEED)
+    far = jumps.farthest(TAKEOFF_SPEED)
+    back = jumps.leans_back(BACK, TAKEOFF_SPEED)
     objective = (lambda motion: far(motion) + lean * back(motion)) if lean else far
     return Problem(FORWARD_KNOTS, objective, constraints, motors_of(torque, speed), command_filter(), **settings)
 
@@ -331,15 +359,13 @@ LANDING = Knots((*UP.at, 48.0, 52.0, *map(float, range(54, 74, 2)), 80.0, 90.0, 
 """Knots of vertical jumps, continued to a second after touchdown."""
 
 
-def _vertical(
-    objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any
-) -> Problem:  # fmt: skip
+def _vertical(objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any) -> Problem:
     """Return the optimisation problem of a vertical jump; more: additional constraints; torque [N m]: limit."""
     constraints = (jumps.clear(), jumps.upright(TILT, at_end=False), jumps.drifts(DRIFT), *more)
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
 
-FINE: dict[str, Any] = {"substeps": SUBSTEPS}  # Arguments of `Problem`: physics steps per policy step
+FINE: Json = {"substeps": SUBSTEPS}  # Arguments of `Problem`: physics steps per policy step
 COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
 QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
@@ -347,9 +373,9 @@ UPWARD = (
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
-CALM: dict[str, Any] = {"slack": 0.03, "check_every": 5, "return_scale": 0.7}
+CALM: Json = {"slack": 0.03, "check_every": 5, "return_scale": 0.7}
 """Settings of stages that often return to the best motion and continue with smaller steps."""
-CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
+CALMEST: Json = CALM | {"slack": 0.02}
 FORWARD = (
     (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
     (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
@@ -389,7 +415,7 @@ JUMPS = {
         lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",
     ),
 }  # fmt: skip
-LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
+LIMITS: dict[str, tuple[str, Json]] = {
     "torque_24_8": ("24.8 N m", {"torque": 24.8}), "speed": ("motor speeds × 1.5", {"speed": 1.5}),
     "friction_1_5": ("friction 1.5", {"friction": 1.5}), "friction_0_6": ("friction 0.6", {"friction": 0.6}),
     "pitch": ("any pitch at landing", {"pitch": FREE}), "stance": ("stance beyond 0.3 m", {"away": FREE}),
@@ -417,8 +443,10 @@ def optimise(
     costs: list[torch.Tensor] = []
     candidates = begin
     for number, (how, stage) in enumerate(jump.stages):
-        problem, record = problems[str(how)], lambda _, last: costs.append(last)
-        candidates = smoothed(problem, candidates, stages=(stage,), seed=seed + number, callback=record)
+        problem = problems[str(how)]
+        candidates = smoothed(
+            problem, candidates, stages=(stage,), seed=seed + number, callback=lambda _, last: costs.append(last)
+        )
         best = float(costs[-1][0])
         announce(f"{jump.label}, stage {number + 1} of {len(jump.stages)}: cost with penalties {best:.3f}")
     progress = minimise(problems[str(FINE)], candidates, iterations=polish, step=0.01, seed=seed)
@@ -456,9 +484,12 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
 
     best: solutions (len(knots),) by name of the jump; one may start this search, and the new one is added.
     """
-    jump, wall, cpu = ALL_JUMPS[name], time.perf_counter(), time.process_time()
-    settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
-    knots, rng = jump.make(**FINE, **settings).knots, np.random.default_rng(args.seed)
+    jump = ALL_JUMPS[name]
+    wall = time.perf_counter()
+    cpu = time.process_time()
+    settings: Json = {"device": args.device, "threads": args.threads}
+    knots = jump.make(**FINE, **settings).knots
+    rng = np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
         begin = np.concatenate([begin, noisy_variants(best[jump.after], knots, rng)])
@@ -472,12 +503,13 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     return values | {"value": jump.value(replay), "violation": replay.violation}, replay
 
 
-def main(args: Args) -> dict[str, Any]:
+def main(args: Args) -> Json:
     """Optimise the jumps in order, write their replays, and return the metrics."""
     torch.set_num_threads(1)  # arrays of torch are small; the simulated worlds use the cores
-    folder, best = prepare("trajectory_optimization", args, args.threads), {}
+    folder = prepare("trajectory_optimization", args, args.threads)
+    best = {}
     replays: dict[str, MotionReplay] = {}
-    values: dict[str, Any] = {}
+    values: Json = {}
     for name in tracked(args.jumps, "optimising jumps"):
         row, replay = run_jump(name, args, folder, best)
         replays[ALL_JUMPS[name].label] = replay

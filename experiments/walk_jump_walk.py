@@ -22,7 +22,7 @@ from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_cours
 from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.policies.skills import SkillNames
+from jumper_warp.evaluation.skills import SkillNames
 from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from support.scripts import run_script
@@ -63,7 +63,8 @@ def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
 
 def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
     """Return the sequence of commands of the paper's test: random walks, a jump up, walks, a jump ahead, walks."""
-    up, ahead = ScriptStep("jump_up", (HEIGHT,)), ScriptStep("jump_to", (DISTANCE, 0.0))
+    up = ScriptStep("jump_up", (HEIGHT,))
+    ahead = ScriptStep("jump_to", (DISTANCE, 0.0))
     before, between, after = (random_walks(rng, count) for count in WALKS)
     return [*before, up, *between, ahead, *after]
 
@@ -92,7 +93,8 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return one script of walks and jumps per robot."""
-    rng, blocks = np.random.default_rng(args.stream_seed), args.blocks and args.solver == "jumper"
+    rng = np.random.default_rng(args.stream_seed)
+    blocks = args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 
@@ -101,7 +103,7 @@ def main(args: Args) -> dict:
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun(SkillNames(args.policy, args.jump_up, args.jump_to)).prepare_from(name, args)
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))
-    course.warn_beyond_training(run.skills.tasks)
+    course.warn_beyond_training(run.tasks)
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
     paper = {} if args.course else {f"settled_{key}": value for key, value in VelocityEvaluation.published.items()}

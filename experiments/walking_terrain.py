@@ -59,7 +59,9 @@ def walked_fraction(walks: VelocityLog) -> np.ndarray:
 def main(args: Args) -> dict:
     """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, VelocityEvaluation)
-    commands, metrics, fractions = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
+    commands = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1))
+    metrics = {}
+    fractions = {}
     steps = (args.step_height, args.step_height)
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=steps, seed=args.stream_seed)
     for kind in args.terrains:

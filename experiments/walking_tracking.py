@@ -19,7 +19,6 @@ that the policy was not trained on.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class GaitRecorder:
     Lists have one array per sampled policy step; paws FL, FR, BL, BR.
     """
 
-    env: Any  # The sampled `jumper_warp.envs.env.Env`
+    env: Env  # The sampled `jumper_warp.envs.env.Env`
     skip: float = 2.0  # [s] Time at the start that is not sampled
     contact: list[np.ndarray] = field(default_factory=list)  # (robots, 4) Whether each paw is on the ground
     paw_height: list[np.ndarray] = field(default_factory=list)  # [m] (robots, 4) Height of paws above the ground
@@ -53,7 +52,7 @@ class GaitRecorder:
     speed: list[np.ndarray] = field(default_factory=list)  # [m/s] (robots,) Horizontal speed of the base
     steps: int = 0  # Number of policy steps so far, skipped ones included
 
-    def __call__(self, *_: Any) -> None:
+    def __call__(self, *_: object) -> None:
         """Append a sample of the gait, unless within `skip` of the start."""
         self.steps += 1
         if self.steps <= round(self.skip / self.env.step_dt):
@@ -79,28 +78,45 @@ class GaitRecorder:
         mass = model.body_mass.numpy().reshape(-1, int(BODIES)).sum(axis=1)
         weight = (mass * np.linalg.norm(model.gravity.numpy()[: len(mass)], axis=1))[standing]
         return gait_metrics(
-            np.array(self.contact)[:, standing], np.array(self.paw_height)[:, standing],
-            np.array(self.force)[:, standing], np.array(self.torque)[:, standing], np.array(self.power)[:, standing],
-            np.array(self.speed)[:, standing], weight, self.env.step_dt,
-        )  # fmt: skip
+            np.array(self.contact)[:, standing],
+            np.array(self.paw_height)[:, standing],
+            np.array(self.force)[:, standing],
+            np.array(self.torque)[:, standing],
+            np.array(self.power)[:, standing],
+            np.array(self.speed)[:, standing],
+            weight,
+            self.env.step_dt,
+        )
 
 
 def gait_metrics(
-    contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
-    speed: np.ndarray, weight: np.ndarray, step_dt: float,
-) -> Metrics:  # fmt: skip
+    contact: np.ndarray,
+    paw_height: np.ndarray,
+    force: np.ndarray,
+    torque: np.ndarray,
+    power: np.ndarray,
+    speed: np.ndarray,
+    weight: np.ndarray,
+    step_dt: float,
+) -> Metrics:
     """Compute step frequency, swing height, contact patterns, torques and cost of transport of walks.
 
     The arrays are the lists of `GaitRecorder`, (steps, robots, ...).
     weight [N]: (robots,); step_dt [s]: policy step. The cost of transport is mean power / (weight * mean speed); None
     if a robot does not move. `share_down_<paws>` is the fraction of time in which exactly these paws touch the ground.
     """
-    apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
-                                           for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
-    seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
+    apexes = np.concatenate(
+        [
+            np.zeros(0),
+            *(swing_apexes(contact[:, i, k], paw_height[:, i, k]) for i in range(contact.shape[1]) for k in range(4)),
+        ]
+    )
+    seconds = len(contact) * step_dt
+    robots = max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
     transport = power.mean(axis=0)
-    load, mean_speed = force.sum(axis=2) / weight, speed.mean(axis=0)
+    load = force.sum(axis=2) / weight
+    mean_speed = speed.mean(axis=0)
     metrics: dict[str, float | None] = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
         "swing_apex_median_m": float(np.median(apexes)) if len(apexes) else None,
@@ -123,7 +139,8 @@ def gait_metrics(
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Return the largest height [m] in each complete swing of one paw, (swings,); contact, height [m]: (steps,)."""
     edges = np.diff(contact.astype(int))
-    lifts, lands = np.flatnonzero(edges == -1) + 1, np.flatnonzero(edges == 1) + 1
+    lifts = np.flatnonzero(edges == -1) + 1
+    lands = np.flatnonzero(edges == 1) + 1
     lands = lands[lands > lifts[0]] if len(lifts) else lands[:0]
     return np.array([height[a:b].max() for a, b in zip(lifts, lands, strict=False)])
 
@@ -180,7 +197,8 @@ class KickedWalks(VelocityLog):
 def kicked_walks(env: Env, rng: np.random.Generator) -> KickedWalks:
     """Return an empty log for walks of 7 s with a random command, and a kick in a random direction after 2 to 4 s."""
     n = env.num_envs
-    commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
+    commands = rng.uniform(-REACH, REACH, (n, 1, 3))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return KickedWalks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
 
@@ -222,7 +240,8 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles, or falls.
     hold [s]: time for which the velocity must stay; None: to the end, so that later pushes count too.
     """
-    window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
+    window = round(SMOOTHING / walks.step_dt)
+    first = round(walks.times[-1] / walks.step_dt)
     velocity = walks.velocity_history()[..., :2]
     total = np.cumsum(velocity, axis=0)
     smooth = velocity.copy()
@@ -254,7 +273,8 @@ def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width
     Robots are grouped by commanded speed into bins of a width; the result is the largest command of its bin.
     commanded, width [m/s] or [rad/s]; commanded: (robots,), at least 0; kept: (robots,) bool, of `kept_speeds`.
     """
-    bins, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
+    bins = np.floor(commanded / width + 1.0e-9).astype(int)
+    top = 0.0
     for number in np.unique(bins):
         inside = bins == number
         if kept[inside].mean() >= share:
@@ -312,28 +332,34 @@ def main(args: Args) -> dict:
     rng = np.random.default_rng(args.stream_seed)
     flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
     log = flags.log(run.task, args.stream_seed)
-    walks, env = run.run_episodes(run.env(log.count), log), run.env(args.commands_per_axis**3)
+    walks = run.run_episodes(run.env(log.count), log)
+    env = run.env(args.commands_per_axis**3)
     redirected = run.run_episodes(env, redirected_walks(env, rng), film="walk")
     settling = settling_times(redirected)
     fast, direction = sped_up_walks(env)
     run.run_episodes(env, fast)
     kicked = run.run_episodes(env, kicked_walks(env, rng))
-    straight, gait = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task), GaitRecorder(env)
+    straight = VelocityLog(np.tile([GAIT_SPEED, 0.0, 0.0], (env.num_envs, 1, 1)), env.task)
+    gait = GaitRecorder(env)
     run.run_episodes(env, straight, on_step=gait)
     plot_tracking(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(redirected, HOLD)))
     times = {"settling_time_median_s": median, "settling_time_for_half_a_second_median_s": held}
     return run.report(
         flags.metrics(walks)
-        | {name: MetricValue(time if np.isfinite(time) else None, env.num_envs, None, "redirected robots")
-           for name, time in times.items()}
-        | {"redirected_fall_rate": rate(redirected.fallen, "redirected robots"),
-           "kicked_fall_rate": rate(kicked.fallen, "kicked robots")}
+        | {
+            name: MetricValue(time if np.isfinite(time) else None, env.num_envs, None, "redirected robots")
+            for name, time in times.items()
+        }
+        | {
+            "redirected_fall_rate": rate(redirected.fallen, "redirected robots"),
+            "kicked_fall_rate": rate(kicked.fallen, "kicked robots"),
+        }
         | speed_metrics(fast, direction)
         | gait.metrics(~straight.fallen),
         PAPER,
         SUMMARY,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

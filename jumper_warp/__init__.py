@@ -10,7 +10,7 @@ from jumper_warp.utils.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env as Env
-    from jumper_warp.policies.runs import load_policy as load_policy
+    from jumper_warp.policies.policy import load_policy as load_policy
     from jumper_warp.recipe import Recipe as Recipe
     from jumper_warp.registry import make_task as make_task
     from jumper_warp.robot.model import build_model as build_model
@@ -24,7 +24,7 @@ _MODULES = {
     "Simulation": "jumper_warp.sim.simulation",
     "SolverJumper": "jumper_warp.sim.solver",
     "build_model": "jumper_warp.robot.model",
-    "load_policy": "jumper_warp.policies.runs",
+    "load_policy": "jumper_warp.policies.policy",
     "make_task": "jumper_warp.registry",
     "train": "jumper_warp.training",
 }

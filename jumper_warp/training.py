@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jumper_warp.policies.warm_start import actor_init_from_policy
+from jumper_warp.policies.policy import actor_init_from_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
 from jumper_warp.rl.run_folder import TrainResult

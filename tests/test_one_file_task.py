@@ -16,7 +16,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.episodes import EpisodePlayFlags
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import load_task_module, make_task
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError

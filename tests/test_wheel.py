@@ -18,7 +18,7 @@ BUILD = "from setuptools.build_meta import build_wheel; print(build_wheel('.'))"
 USE_PACKAGE = """
 import jumper_warp
 from jumper_warp.cli.main import main
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.robot.description import load_description
 

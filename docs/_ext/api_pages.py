@@ -36,12 +36,11 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (
-        "policies.folder", "policies.policy", "policies.spec", "policies.catalog", "policies.conditions",
-        "policies.skills", "policies.runs", "policies.onnx", "policies.blend", "policies.warm_start",
-        "deploy.policy",
+        "policies.policy", "policies.spec", "policies.catalog", "policies.onnx", "deploy.policy",
     )),
     "evaluation": ("Evaluation", (
-        "evaluation.run", "evaluation.evaluations", "evaluation.log", "evaluation.commands", "evaluation.suites",
+        "evaluation.run", "evaluation.conditions", "evaluation.skills", "evaluation.evaluations",
+        "evaluation.log", "evaluation.commands", "evaluation.suites",
         "evaluation.sweeps", "evaluation.episodes", "evaluation.jump_metrics",
         "evaluation.velocities", "evaluation.attitude", "evaluation.jumps", "evaluation.courses",
         "evaluation.scripts", "evaluation.recorder", "evaluation.limits", "evaluation.finetuning",

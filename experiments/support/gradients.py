@@ -87,8 +87,10 @@ class GradientJump:
         jump = self.run(inputs)
         cotangent = np.zeros(jump.q.shape)
         cotangent[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
-        grads = {name: array.numpy()[..., 0].astype(float) for name, array in
-                 self.rollout.backward(jump, q=self.rollout.array(cotangent)).items()}  # fmt: skip
+        grads = {
+            name: array.numpy()[..., 0].astype(float)
+            for name, array in self.rollout.backward(jump, q=self.rollout.array(cotangent)).items()
+        }
         grads["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), grads["table"][:, None])["mass"][:, 0]
         return jump, grads
 
@@ -146,7 +148,8 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
     jump = GradientJump(1, double=True, device=device)
     trajectory, grads = jump.gradients({})
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
-    coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
+    coords = [2, 3, 4, 5, *range(7, 19)]
+    rates = list(range(18))
 
     def compare(gradient: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> GradientPair:
         """Pair derivatives of the apex along directions of an input with their central differences."""

@@ -22,6 +22,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import Learner
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
 from support.timing import process_age
 
@@ -71,7 +72,8 @@ def success_rate(trainer: Learner, eval_env: Env, limits: tuple[float, float] | 
 
     limits [m]: lowest and highest height or distance; None: those of TEST_RANGES.
     """
-    kind, count = eval_env.task.evaluation.kind, eval_env.num_envs
+    kind = eval_env.task.evaluation.kind
+    count = eval_env.num_envs
     limits = limits or TEST_RANGES[kind]
     goals = places_ahead(limits, count) if kind == "place" else np.linspace(*limits, count)
     return float(run_jumps(trainer.model.act, eval_env, goals).success.mean())
@@ -87,9 +89,14 @@ def warm_up(env: VecEnv, trainer: Learner) -> None:
 
 
 def train_and_evaluate(
-    env: VecEnv, trainer: Learner, eval_env: Env, length: float, every: float,
-    limits: tuple[float, float] | None = None, by_iterations: bool = False,
-) -> LearningCurve:  # fmt: skip
+    env: VecEnv,
+    trainer: Learner,
+    eval_env: Env,
+    length: float,
+    every: float,
+    limits: tuple[float, float] | None = None,
+    by_iterations: bool = False,
+) -> LearningCurve:
     """Train for a time or a number of iterations, evaluate at intervals, and return the learning curve.
 
     Schedules follow `length`, as in `jumper train --max-seconds` or `--max-iterations`. Compilation (`warm_up`)
@@ -98,10 +105,15 @@ def train_and_evaluate(
     and every: between two evaluations, [s] or number of iterations; limits [m]: see `success_rate`.
     """
     warm_up(env, trainer)
-    curve, trained, spent, device = LearningCurve(), 0.0, 0.0, wp.device_from_torch(env.device)
+    curve = LearningCurve()
+    trained = 0.0
+    spent = 0.0
+    device = wp.device_from_torch(env.device)
     while spent < length:
         wp.synchronize_device(device)
-        start, before, until = time.perf_counter(), trained, min(spent + every, length)
+        start = time.perf_counter()
+        before = trained
+        until = min(spent + every, length)
         while spent < until:
             trainer.set_progress(spent / length)
             trainer.iterate()
@@ -124,26 +136,29 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     env = Env(task, args.num_envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
     trainer = make_ppo(env, cfg)
     warm_up(env, trainer)
-    ready, eval_env = process_age(), make_eval_env(task, args.num_jumps, args.device)
+    ready = process_age()
+    eval_env = make_eval_env(task, args.num_jumps, args.device)
     success_rate(trainer, eval_env)
     length, every = args.seconds, args.eval_interval
     if args.iterations:
-        length, every = args.iterations, max(1, args.iterations // EVALUATIONS)
+        length = args.iterations
+        every = max(1, args.iterations // EVALUATIONS)
     curve = train_and_evaluate(env, trainer, eval_env, length, every, args.goal_range, bool(args.iterations))
     curve.ready = ready
     return curve
 
 
-def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
+def curve_metrics(curve: LearningCurve, name: str) -> Json:
     """Return final success, and time and steps to reach each of RATES, of one training's learning curve.
 
     Keys: `<metric>_<name>`.
     """
-    values: dict[str, Any] = {f"success_{name}": curve.success[-1]}
+    values: Json = {f"success_{name}": curve.success[-1]}
     values |= {f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
-        i, key = curve.reached(rate), f"{100 * rate:g}_percent_{name}"
+        i = curve.reached(rate)
+        key = f"{100 * rate:g}_percent_{name}"
         values[f"seconds_to_{key}"] = None if i is None else curve.seconds[i]
         values[f"steps_to_{key}"] = None if i is None else curve.steps[i]
     return values
@@ -155,7 +170,8 @@ def compare(first: Sequence[LearningCurve], second: Sequence[LearningCurve], rat
     Two-sided rank tests (Mann-Whitney) of the steps to a success rate, infinite if it is not reached, and of the final
     success. Keys: `p_steps_to_95_percent`, `p_final_success`.
     """
-    steps, final = [], []
+    steps = []
+    final = []
     for curves in (first, second):
         indices = [curve.reached(rate) for curve in curves]
         steps.append([math.inf if i is None else curve.steps[i] for i, curve in zip(indices, curves, strict=True)])

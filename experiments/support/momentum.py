@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jumper_warp.envs.env import Env
+from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.metrics import Metrics, largest, mean
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
-def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
+def momentum(sim: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Return the linear [kg m/s] and angular momentum [kg m^2/s] about the robot's COM, (num_worlds, 3) each.
 
     sim: a `Simulation`. World axes. The spin of rotors relative to their links, which turns no link, is not included.
@@ -22,7 +24,7 @@ def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
     return linear.sum(axis=1), (np.cross(arm, linear) + rotate(quat, spin)).sum(axis=1)
 
 
-def rotational_inertia(sim: Any) -> np.ndarray:
+def rotational_inertia(sim: Simulation) -> np.ndarray:
     """Return the inertia [kg m^2] of the robot with locked joints about its COM, world axes, (num_worlds, 3, 3)."""
     mass, inertia, quat, arm, _ = _links(sim)
     columns = []
@@ -43,7 +45,7 @@ class LinkStates(NamedTuple):
     twist: np.ndarray  # (..., 6) velocity of the COM [m/s] and angular velocity [rad/s], world axes
 
 
-def _links(sim: Any) -> LinkStates:
+def _links(sim: Simulation) -> LinkStates:
     """Return the present state of all links of a `Simulation`; waits for the device."""
     model, n = sim.model, sim.num_worlds
     sim.write_bodies()
@@ -60,10 +62,10 @@ def _links(sim: Any) -> LinkStates:
 class MomentumRecorder:
     """Recorder of the angular momentum of all robots; call the object after every policy step."""
 
-    env: Any  # The recorded `jumper_warp.envs.env.Env`
+    env: Env  # The recorded `jumper_warp.envs.env.Env`
     angular: list[np.ndarray] = field(default_factory=list)  # [kg m^2/s] (num_envs, 3) per policy step, world axes
 
-    def __call__(self, *_: Any) -> None:
+    def __call__(self, *_: object) -> None:
         """Append the present angular momentum about the COM."""
         self.angular.append(momentum(self.env.sim)[1])
 
@@ -73,9 +75,11 @@ class MomentumRecorder:
         Diverged robots are left out.
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
         """
-        drift, over = np.array(self.angular)[:, ~diverged], "turns that did not diverge"
+        drift = np.array(self.angular)[:, ~diverged]
+        over = "turns that did not diverge"
         turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
-        size, turn = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
+        size = np.linalg.norm(drift, axis=-1)
+        turn = np.degrees(np.linalg.norm(turned, axis=-1))
         return {
             "angular_momentum_max_nm_s": largest(size.max(axis=0), over),
             "angular_momentum_at_end_mean_nm_s": mean(size[-1], over),

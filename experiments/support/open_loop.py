@@ -70,11 +70,20 @@ def simulate_jump(sim: Simulation, notes: Mapping[str, Any], squat: float = SQUA
         for _ in range(sim.substeps):
             sim.physics_step()
             now = (len(rows) + 1) * sim.dt
-            q, qd = sim.joint_q()[0], sim.joint_qd()[0]
+            q = sim.joint_q()[0]
+            qd = sim.joint_qd()[0]
             rows.append(
-                (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
-                 sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
-            )  # fmt: skip
+                (
+                    now,
+                    q[2],
+                    sim.base_velocity()[0, 2],
+                    motor_values(q[7:]),
+                    motor_values(qd[6:]),
+                    sim.torque.numpy()[:, 0].copy(),
+                    sim.paw_force.numpy()[:, 0].copy(),
+                    sim.loop_gap()[0],
+                )
+            )
         forces = np.array([row[6] for row in rows[-sim.substeps :]])
         record(recorder, sim.state.body_q.numpy(), rows[-1], largest_forces(forces))
     return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder

@@ -84,7 +84,8 @@ class PinocchioRobot:
         pin.forwardKinematics(self.model, self.data, q, v)
         velocities = []
         for c in self.constraints:
-            twist, rotation = self.data.v[c.joint1_id], self.data.oMi[c.joint1_id].rotation
+            twist = self.data.v[c.joint1_id]
+            rotation = self.data.oMi[c.joint1_id].rotation
             velocities.append(rotation @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
         return np.array(velocities)
 
@@ -129,8 +130,10 @@ class PinocchioRobot:
 
     def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
         """Return the knee angles (outer, inner) [rad] that close a leg's loop at given thigh angles [rad]."""
-        origin = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
-                  for name in ("outer", "inner", "outer_knee")}  # fmt: skip
+        origin = {
+            name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
+            for name in ("outer", "inner", "outer_knee")
+        }
         separation = abs(origin["outer"][0] - origin["inner"][0])
         thigh = -origin["outer_knee"][2]
         shank = -self.constraints[LEGS.index(leg)].joint1_placement.translation[2]
@@ -140,7 +143,8 @@ class PinocchioRobot:
         cosine = 0.5 * math.hypot(across, down) / shank
         if not cosine < 1.0:
             raise InputError(f"expected knees of {leg} within reach of the shanks, found {2.0 * shank * cosine:.4f} m")
-        base, slope = math.acos(cosine), math.atan2(down, across)
+        base = math.acos(cosine)
+        slope = math.atan2(down, across)
         return outer + 0.5 * math.pi + slope - base, inner + 0.5 * math.pi - slope - base
 
 

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.folder import add_files
+from jumper_warp.policies.catalog import add_files
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.assets import POLICIES
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.metrics import MetricValue
 
 COMBINED = "combined"  # Name that stands for walking and jumping with three policies, in place of a policy's
 METRICS = "metrics.json"  # Name of a row's file, and of a policy's
 RESULTS = Path(__file__).parents[2] / "docs/results"  # Pages with results
 RANDOMISED = {"randomize": True, "noise": True}
-CONDITIONS: dict[str, tuple[str, dict[str, Any]]] = {
+CONDITIONS: dict[str, tuple[str, Json]] = {
     "nominal": ("nominal", {}),
     "randomised": ("randomised robots, noise, latency, pushes", RANDOMISED),
     "mujoco": ("nominal, SolverMuJoCo", {"solver": "mujoco"}),
@@ -33,8 +33,8 @@ CONDITIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "push_in_flight": ("randomised, pushed in flight too", RANDOMISED | {"push_in_flight": True}),
 }  # fmt: skip
 """Title in tables and fields of `Conditions` by name, in the order of the tables; `payload` [kg] is a robot overlay."""
-PAGES: dict[str, Any] = tomllib.loads((Path(__file__).parents[1] / "policy_pages.toml").read_text(encoding="utf-8"))
-TESTS: dict[str, dict[str, Any]] = PAGES["tests"]
+PAGES: Json = tomllib.loads((Path(__file__).parents[1] / "policy_pages.toml").read_text(encoding="utf-8"))
+TESTS: dict[str, Json] = PAGES["tests"]
 """Tests of single policies or of three in combination by name: `words` in tables, `policies`, and `command`."""
 
 
@@ -44,9 +44,9 @@ class Row(NamedTuple):
     policy: str
     condition: str  # Key of CONDITIONS or TESTS
     seed: int
-    values: dict[str, Any]  # Conditions by name, as in metrics.json
+    values: Json  # Conditions by name, as in metrics.json
     metrics: dict[str, MetricValue]
-    entries: dict[str, Any]  # The same metrics as metrics.json has them
+    entries: Json  # The same metrics as metrics.json has them
 
 
 def undefined(task: TaskCfg, name: str) -> str | None:
@@ -71,10 +71,13 @@ def ordered_rows(policy: str, saved: Iterable[tuple[str, int, Mapping[str, Any]]
 
     The JSON data have the keys `conditions` and `metrics`.
     """
-    rows, order = [], [*CONDITIONS, *TESTS]
+    rows = []
+    order = [*CONDITIONS, *TESTS]
     for condition, seed, data in saved:
-        metrics = {key: MetricValue(x["value"], x["trials"], x["interval"] and tuple(x["interval"]), x["over"])
-                   for key, x in data["metrics"].items()}  # fmt: skip
+        metrics = {
+            key: MetricValue(x["value"], x["trials"], x["interval"] and tuple(x["interval"]), x["over"])
+            for key, x in data["metrics"].items()
+        }
         rows.append(Row(policy, condition, seed, data["conditions"], metrics, data["metrics"]))
     return sorted(rows, key=lambda row: (order.index(row.condition), row.seed))
 
@@ -120,10 +123,11 @@ def save_to_policies(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> None:
         known = {row[1:3]: row for row in (*saved_rows(policy), *(row for row in rows if row.policy == policy))}
         data = {key: {"conditions": _conditions(row), "metrics": row.entries} for key, row in known.items()}
         lines = [
-            json.dumps({"condition": row.condition, "seed": row.seed} | data[row[1:3]], ensure_ascii=False,
-                       allow_nan=False)
+            json.dumps(
+                {"condition": row.condition, "seed": row.seed} | data[row[1:3]], ensure_ascii=False, allow_nan=False
+            )
             for row in ordered_rows(policy, [(*key, value) for key, value in data.items()])
-        ]  # fmt: skip
+        ]
         head = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False).removesuffix("\n}")
         text = f'{head},\n  "rows": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
         if policy == COMBINED:
@@ -132,7 +136,7 @@ def save_to_policies(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> None:
             add_files(path.parent, {METRICS: text.encode()})
 
 
-def _conditions(row: Row) -> dict[str, Any]:
+def _conditions(row: Row) -> Json:
     """Return the conditions of a result for metrics.json, without the path of a payload's overlay."""
     values = {name: value for name, value in row.values.items() if name != "robot" or "payload_kg" not in row.values}
     return values | ({"commands": TESTS[row.condition]["words"]} if row.condition in TESTS else {})

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from jumper_warp.cli.main import parse, run_command
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
@@ -79,9 +80,13 @@ def tracked(items: Collection[Item], title: str) -> Iterator[Item]:
 
 
 def report(
-    args: PrintFlags, folder: Path, values: dict[str, Any], done: str, keys: Iterable[str],
+    args: PrintFlags,
+    folder: Path,
+    values: Json,
+    done: str,
+    keys: Iterable[str],
     paper: Mapping[str, float] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Json:
     """Write metrics by name to `metrics.json` in a folder, print a summary, and return the metrics.
 
     done: what was done, the first line; keys: of the metrics in the summary, missing ones are skipped; paper: published

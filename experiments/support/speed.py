@@ -56,7 +56,9 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
 
     Raises RuntimeError: a robot does not reach 0.8 m.
     """
-    times, apex, push = [], np.zeros(1), JUMP_STEPS // 3
+    times = []
+    apex = np.zeros(1)
+    push = JUMP_STEPS // 3
     for repeat in range(repeats + 1):
         command(sim, DEFAULT, 60)
         command(sim, SQUAT, 40)
@@ -79,7 +81,8 @@ def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device:
     envs: number of environments; steps: in each repetition of standing.
     """
     build_model(1, device=device)  # Newton's own modules are not part of the metrics
-    before, sims = device_memory(wp.get_device(device)), []
+    before = device_memory(wp.get_device(device))
+    sims = []
 
     def build() -> None:
         """Build the simulation, compile its kernels and capture its graph."""
@@ -162,7 +165,8 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
     Names are those of `Env.stages`; every part begins from the same state.
     """
     env, _ = stepping_env(envs, device)
-    saved, parts = env.state_dict(), {}
+    saved = env.state_dict()
+    parts = {}
     for name in env.stages():
         graph = SlicedGraph(lambda worlds, name=name: env.stages(worlds)[name](), env.sim.slices, env.wp_device)
         parts[name] = median_time(graph.replay, device, CALLS, repeats)
@@ -203,7 +207,8 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     wp.synchronize_device(device)
-    ready, stopwatch = time.perf_counter() - begin, Stopwatch(env.device)
+    ready = time.perf_counter() - begin
+    stopwatch = Stopwatch(env.device)
 
     def iterate() -> None:
         stopwatch.start()

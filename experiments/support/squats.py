@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,8 @@ class SquatLog(EvaluationLog):
     row_name = "squat"
 
     def __post_init__(self) -> None:
-        self.count, self.step_dt = len(self.goals), 1.0 / 60.0
+        self.count = len(self.goals)
+        self.step_dt = 1.0 / 60.0
         self.ended = np.zeros(self.count, dtype=bool)  # (num_envs,) whether each episode has ended
         # one array per policy step
         self.peaks: list[np.ndarray] = []  # [N] (num_envs, 4) largest force on each paw over its physics steps
@@ -42,7 +42,7 @@ class SquatLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return paw forces, motor torques and termination of the robots by name, for `update`.
 
         `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,).
@@ -102,7 +102,9 @@ def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarr
 
 def squat_metrics(squats: SquatLog) -> Metrics:
     """Return the metrics of held squats by name; forces and torques are of the robots that hold to the end."""
-    spread, ripple, over = squats.force_range, squats.torque_ripple, "robots that held to the end"
+    spread = squats.force_range
+    ripple = squats.torque_ripple
+    over = "robots that held to the end"
     median = float(np.median(spread)) if len(spread) else None
     lost = squats.in_window(squats.forces) < CONTACT_FORCE
     return {

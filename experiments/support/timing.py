@@ -77,7 +77,8 @@ def changed_flags(args: Any) -> list[str]:
     """
     flags: list[str] = []
     for spec in dataclasses.fields(args):
-        value, name = getattr(args, spec.name), spec.name.replace("_", "-")
+        value = getattr(args, spec.name)
+        name = spec.name.replace("_", "-")
         make = spec.default_factory
         default = spec.default if make is dataclasses.MISSING else make()
         if spec.name in ("out", "baseline") or value == default:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 DEFAULT = "default"  # Name of the unchanged settings
-VARIANTS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, Json] = {
     DEFAULT: {},
     "eager": {"fused": False},
     "four_minibatches": {"minibatches": 4},

@@ -59,7 +59,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.registry import task_names
     from jumper_warp.utils.assets import policy_tasks
 
-    tasks, policies = task_names(), tuple(policy_tasks())
+    tasks = task_names()
+    policies = tuple(policy_tasks())
     names: dict[str, Iterable[str]] = dict.fromkeys(("play", "evaluate", "finetune", "export"), policies)
     names |= {"train": tasks, "info": (*tasks, *policies), "sysid": ("fit", "excite", "actuator")}
     names["completion"] = ("bash", "zsh")

@@ -59,13 +59,15 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
-    suites, name = suites_for(task), "".join(args[flag + 1 : flag + 2])
+    suites = suites_for(task)
+    name = "".join(args[flag + 1 : flag + 2])
     if name not in suites:
         if not suites:
             raise UsageError(f"there are no suites for policies of {task.name}")
         near = suggestion(name, suites) or f"; there are {', '.join(suites)}"
         raise UsageError(f"no suite {name!r:.60} for policies of {task.name}{near}")
-    command, default = f"evaluate {args[0]} {SUITE} {name}", suites[name](policy=args[0])
+    command = f"evaluate {args[0]} {SUITE} {name}"
+    default = suites[name](policy=args[0])
     parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(list(modules))
 
 

@@ -44,23 +44,20 @@ def export(cfg: ExportCfg) -> Path:
     cannot be used, two policies cannot be blended, the folder has a file's suffix, or exists without `overwrite`.
     CheckpointError: the checkpoint cannot be used.
     """
-    from jumper_warp.policies.blend import blend
-    from jumper_warp.policies.catalog import newest_run
-    from jumper_warp.policies.folder import checked_folder, save_policy
-    from jumper_warp.policies.onnx import export_onnx
-    from jumper_warp.policies.runs import is_run, learning_curve, open_policy, run_folder
+    from jumper_warp.policies.catalog import is_run, newest_run, run_folder
+    from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.resume import CHECKPOINTS
 
     source = Path(newest_run(cfg.source))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out, cfg.overwrite)
     trained = is_run(source)
-    policy = open_policy(source, newest=cfg.newest)
+    policy = Policy.load(source, newest=cfg.newest)
     if trained:
         chosen = ("newest " if cfg.newest else "best ") if (source / CHECKPOINTS).is_dir() else ""
         print(f"{run_folder(source)}: {chosen}checkpoint, iteration {policy.config['iteration']}", file=sys.stderr)
     if cfg.blend is not None:
-        policy = blend(policy, open_policy(cfg.blend[0]), cfg.blend[1])
+        policy = blend(policy, Policy.load(cfg.blend[0]), cfg.blend[1])
     out = cfg.out
     if out is None:
         out = run_folder(source) / "policy" if trained else Path(f"{policy.interface.task}.onnx")

@@ -34,12 +34,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     with phase(f"opening {name}"):
         from jumper_warp.evaluation.finetuning import finetune
-        from jumper_warp.policies.folder import checked_folder, save_policy
-        from jumper_warp.policies.runs import open_policy
+        from jumper_warp.policies.policy import Policy, checked_folder, save_policy
         from jumper_warp.utils.locks import write_lock
         from jumper_warp.utils.runtime import configure_device
 
-        policy = open_policy(name)
+        policy = Policy.load(name)
     out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"), parsed.overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
     with write_lock(out, out.with_name(f".{out.name}.lock")):  # beside the folder, which is replaced as a whole

@@ -70,8 +70,10 @@ def list_flags(cfg: Any, prefix: str = "", group_about: str = "", *, described: 
     prefix: of all names, with its dot. group_about: of those that are not nested further. described: whether the flags
     have descriptions, whose reading from the sources takes long.
     """
-    kind, flags = cfg if isinstance(cfg, type) else type(cfg), []
-    hints, docs = get_type_hints(kind, include_extras=True), field_docs(kind) if described else {}
+    kind = cfg if isinstance(cfg, type) else type(cfg)
+    flags = []
+    hints = get_type_hints(kind, include_extras=True)
+    docs = field_docs(kind) if described else {}
     for spec in dataclasses.fields(cfg):
         hint, *marks = get_args(hint) if get_origin(hint := hints[spec.name]) is Annotated else (hint,)
         if tyro.conf.Suppress in marks:

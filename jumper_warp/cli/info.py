@@ -15,6 +15,7 @@ import tyro
 
 from jumper_warp.cli.list import describe, size_text
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.tables import WIDTH
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     print(json.dumps(content, indent=2) if cfg.json else "\n".join(lines))
 
 
-def policy_info(policy: PolicySummary) -> tuple[dict[str, Any], list[str]]:
+def policy_info(policy: PolicySummary) -> tuple[Json, list[str]]:
     """Return the description of a policy as JSON data and as lines of text."""
     from jumper_warp.policies.catalog import PICTURE
     from jumper_warp.utils.assets import POLICIES, policy_tasks
@@ -115,8 +116,12 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         words = row["condition"].replace("_", " ")
         lines.append([words, *(_cell(column.key, row["metrics"].get(column.key)) for column in columns)])
     widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-    text = ["  ".join([line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:],
-            strict=True))]) for line in lines]  # fmt: skip
+    text = [
+        "  ".join(
+            [line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))]
+        )
+        for line in lines
+    ]
     trials = max(metric["trials"] or 0 for metric in shown[0]["metrics"].values())
     notes = [f"{trials:,} trials a line" + (f"; commands: {commands}" if commands else "")]
     if any("mujoco" in row["condition"] for row in shown):
@@ -144,7 +149,7 @@ def properties(values: Mapping[str, str]) -> list[str]:
     return [line.replace(UNBROKEN, " ") for line in lines]
 
 
-def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, Any], list[str]]:
+def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[Json, list[str]]:
     """Return the description of a task as JSON data and as lines of text.
 
     modules: loaded by --task-module, for the printed `jumper train` command.
@@ -167,20 +172,24 @@ def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, 
     lines = [f"{name}: {entry.description}" if entry.description else name, ""]
     if content["details"] not in ("", entry.description):
         lines += [*textwrap.wrap(f"{content['details']}.", WIDTH), ""]
-    lines += properties({
-        "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
-        "critic": f"observes {sizes['critic']} numbers",
-        "action": f"{content['action_size']} motor angles",
-        "rewards": ", ".join(f"{term}{UNBROKEN}{weight:g}" for term, weight in rewards.items()),
-        "terminations": ", ".join(content["terminations"]),
-        "policies": ", ".join(content["policies"]), "aliases": ", ".join(entry.aliases), "module": entry.origin,
-        "train": command_line([name], modules).replace(" ", UNBROKEN),
-        "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
-    })  # fmt: skip
+    lines += properties(
+        {
+            "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
+            "critic": f"observes {sizes['critic']} numbers",
+            "action": f"{content['action_size']} motor angles",
+            "rewards": ", ".join(f"{term}{UNBROKEN}{weight:g}" for term, weight in rewards.items()),
+            "terminations": ", ".join(content["terminations"]),
+            "policies": ", ".join(content["policies"]),
+            "aliases": ", ".join(entry.aliases),
+            "module": entry.origin,
+            "train": command_line([name], modules).replace(" ", UNBROKEN),
+            "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
+        }
+    )
     return content, lines
 
 
-def contents_of(task: TaskCfg) -> dict[str, Any]:
+def contents_of(task: TaskCfg) -> Json:
     """Return a task's observation and action sizes, observations, reward weights and terminations as JSON data."""
     return {
         "observation_sizes": {

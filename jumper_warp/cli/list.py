@@ -7,9 +7,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:
     from jumper_warp.policies.catalog import PolicySummary
@@ -45,13 +46,15 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         print(line, file=sys.stderr)
 
 
-def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[dict[str, Any]], list[str]]:
+def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[Json], list[str]]:
     """Return the description of every task as JSON data, and a line for each package whose task cannot be loaded."""
     from jumper_warp.registry import TASKS, installed_tasks, load_installed, package_of
 
-    packages, failures = {}, []
+    packages = {}
+    failures = []
     for entry_point in installed_tasks():
-        name, package = entry_point.name, package_of(entry_point)
+        name = entry_point.name
+        package = package_of(entry_point)
         try:
             load_installed(entry_point)
             packages[name] = package
@@ -59,26 +62,32 @@ def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[dict[str, An
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             failures.append(f"task {name} of package {package} is left out: {reason:.300}")
     tasks = [
-        {"name": name, "about": entry.description, "aliases": list(entry.aliases), "module": entry.origin,
-         "package": packages.get(name), "policies": [policy.name for policy in policies if policy.task == name]}
+        {
+            "name": name,
+            "about": entry.description,
+            "aliases": list(entry.aliases),
+            "module": entry.origin,
+            "package": packages.get(name),
+            "policies": [policy.name for policy in policies if policy.task == name],
+        }
         for name, entry in TASKS.items()
-    ]  # fmt: skip
+    ]
     return tasks, failures
 
 
-def describe(policy: PolicySummary) -> dict[str, Any]:
+def describe(policy: PolicySummary) -> Json:
     """Return a policy's name, task, success rate, error, size and folder as JSON data; None: not evaluated."""
     return {"name": policy.name, "task": policy.task, "success_rate": policy.success, "error": policy.error,
             "size_bytes": policy.size_bytes, "folder": str(policy.folder)}  # fmt: skip
 
 
-def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySummary]) -> None:
+def print_tables(tasks: Sequence[Json], policies: Sequence[PolicySummary]) -> None:
     """Print one table of the tasks and one of the policies, each under a heading."""
     from rich.table import Column, Table
 
     from jumper_warp.utils.tables import print_table
 
-    style: dict[str, Any] = {"box": None, "pad_edge": False, "padding": (0, 2, 0, 0)}
+    style: Json = {"box": None, "pad_edge": False, "padding": (0, 2, 0, 0)}
     table = Table(Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), **style)
     for task in tasks:
         table.add_row(task["name"], task["about"], ",\n".join(task["policies"]))
@@ -94,7 +103,7 @@ def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySumma
     print("", LEGEND, sep="\n")
 
 
-def quantity(metric: dict[str, Any] | None) -> str:
+def quantity(metric: Json | None) -> str:
     """Return value and unit of a metric, as in metrics.json, with two significant digits; empty for None."""
     if metric is None or metric["value"] is None:
         return ""

@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
@@ -121,7 +122,9 @@ def user_file_error(folders: Collection[str], error: Exception) -> str | None:
 
 def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the arguments without `--task-module NAME`, and all NAMEs. Raises UsageError: a value is missing."""
-    rest, names, remaining = [], [], iter(args)
+    rest = []
+    names = []
+    remaining = iter(args)
     for arg in remaining:
         flag, equals, name = arg.partition("=")
         if flag.replace("_", "-") != TASK_MODULE:
@@ -135,9 +138,15 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parse(
-    kind: Any, command: str, args: Sequence[str], *, description: str | None = None, default: Any = None,
-    short: Sequence[str] | None = None, program: str | None = None,
-) -> Any:  # fmt: skip
+    kind: Any,
+    command: str,
+    args: Sequence[str],
+    *,
+    description: str | None = None,
+    default: Any = None,
+    short: Sequence[str] | None = None,
+    program: str | None = None,
+) -> Any:
     """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
 
     kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
@@ -151,7 +160,7 @@ def parse(
 
     from jumper_warp.cli.flags import TASK_MODULE_FLAG, check_numbers, list_flags, print_help, wants_help
 
-    settings: dict[str, Any] = {"prog": program or f"jumper {command}"}
+    settings: Json = {"prog": program or f"jumper {command}"}
     about = description or inspect.getdoc(kind) or ""
     if wants_help(args):
         flags = list_flags(kind if default is None else default) + ([] if program else [TASK_MODULE_FLAG])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,7 +15,7 @@ from jumper_warp.cli.main import INCONSISTENT, TASK_MODULE_HELP, UsageError, par
 from jumper_warp.identification.motions import NoiseLevels, load_motions
 from jumper_warp.identification.parameters import jumper_parameters, total_mass, weighed_mass
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.files import Json, json_bytes, write_atomically
 
 if TYPE_CHECKING:
     from jumper_warp.identification.results import Identification
@@ -139,7 +139,7 @@ def sysid(cfg: SysidCfg) -> None:
 
     cfg.noise.check()
     parameters = jumper_parameters(split_names(cfg.params)).without(split_names(cfg.exclude))
-    settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
+    settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std)]
     recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
     motions = load_motions(cfg.data, gains=cfg.gain_preset, **recorded_with)

@@ -21,6 +21,7 @@ from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 NO_SOURCE = __package__
 """Module name of the dataclasses made here: tyro parses its source, which is fast since the file is empty."""
@@ -67,7 +68,9 @@ def _flag(value: Any, hint: Any, where: str) -> Setting | None:
 
 def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
     """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
-    hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
+    hints = get_type_hints(type(value))
+    docs = field_docs(type(value))
+    flags = {}
     for name, part in _parts(value).items():
         flag = _flag(part, hints[name], f"{where} {name}")
         if flag is not None:
@@ -90,16 +93,19 @@ def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
     if len(set(names)) < len(names) or "" in names:
         raise InputError(f"{where}: the names of {', '.join(flags)} make the same flags")
     fields = [
-        (f"setting_{i}", Annotated[flag.kind, tyro.conf.arg(name=name, help=flag.about)],
-         dataclasses.field(metadata={"flag": name}))
+        (
+            f"setting_{i}",
+            Annotated[flag.kind, tyro.conf.arg(name=name, help=flag.about)],
+            dataclasses.field(metadata={"flag": name}),
+        )
         for i, (name, flag) in enumerate(zip(names, flags.values(), strict=True))
-    ]  # fmt: skip
+    ]
     kind = dataclasses.make_dataclass("Settings", fields, frozen=True, namespace={"__module__": NO_SOURCE})
     kind.__doc__ = about
     return Setting(kind, kind(*(flag.value for flag in flags.values())), about)
 
 
-def _members(group: Any) -> dict[str, Any]:
+def _members(group: Any) -> Json:
     """Return the values of a group of flags by name; group: an instance of a dataclass by `_group`."""
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
@@ -120,7 +126,7 @@ def with_flags(value: Any, flags: Any) -> Any:
     return tuple((parts | new).values()) if isinstance(value, tuple) else dataclasses.replace(value, **new)
 
 
-def _parts(value: Any) -> dict[str, Any]:
+def _parts(value: Any) -> Json:
     """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
     if isinstance(value, Term):
         return {**value.numbers, **value.options}

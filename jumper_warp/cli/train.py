@@ -18,7 +18,7 @@ from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
-from jumper_warp.utils.files import parse_json
+from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
     if not args or args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    preset, args = preset_flags(name, entry, args[1:]), args[1:]
+    preset = preset_flags(name, entry, args[1:])
+    args = args[1:]
     from jumper_warp.recipe import Recipe
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
@@ -136,7 +137,9 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
             f"{other} ({', '.join(known.presets)})" for other, known in TASKS.items() if known.presets
         )
         raise UsageError(f"{task} has no preset {name!r:.60}; tasks with presets: {available}")
-    flags, option, preset = [], "", shlex.split(entry.presets[name])
+    flags = []
+    option = ""
+    preset = shlex.split(entry.presets[name])
     unused = unused_flags("".join(values_of("--trainer", args)[:1]), preset)
     given = {switch_of(option_of(arg)) for arg in args}
     for word in preset:
@@ -163,8 +166,9 @@ def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
     """
     from jumper_warp.cli.task_flags import flags_of, with_flags
 
-    task, flags = recipe.task, flags_of(recipe.task)
-    made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
+    task = recipe.task
+    flags = flags_of(recipe.task)
+    made: Json = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
     default = kind(recipe.train, solver=recipe.solver, randomize=recipe.randomize, noise=recipe.noise)
     about = f"Train a policy on {task.name}."
@@ -198,7 +202,8 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
     args: after `jumper train`. modules: each becomes a --task-module with its file, or its name if it is in a package.
     """
-    kept, remaining = [], iter(args)
+    kept = []
+    remaining = iter(args)
     for arg in remaining:
         if option_of(arg) not in ("--resume", "--init-policy"):
             kept.append(arg)
@@ -217,11 +222,14 @@ def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[st
     """
     from jumper_warp.rl.logger import format_duration
 
-    steps, threads = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs, checked_threads(cfg.threads)
+    steps = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs
+    threads = checked_threads(cfg.threads)
     rate = PRESET_STEPS_PER_SECOND * min(threads, 2) / 2 if preset else CPU_STEPS_PER_SECOND * threads
-    seconds, reason = steps / rate, f": {steps / 1.0e6:.1f} M steps at {rate:,.0f} steps/s"
+    seconds = steps / rate
+    reason = f": {steps / 1.0e6:.1f} M steps at {rate:,.0f} steps/s"
     if 0.0 < cfg.max_seconds < seconds:
-        seconds, reason = cfg.max_seconds, ""
+        seconds = cfg.max_seconds
+        reason = ""
     if seconds < SHORT_TRAINING:
         return
     names = " or ".join(f"--preset {name}" for name in presets)
@@ -241,7 +249,9 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     from jumper_warp.training import train
     from jumper_warp.utils.runtime import configure_device
 
-    cfg, task, preset = recipe.train, recipe.task, bool(values_of("--preset", args))
+    cfg = recipe.train
+    task = recipe.task
+    preset = bool(values_of("--preset", args))
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     rate = 0.0
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:

@@ -182,7 +182,8 @@ def _verified(file: Path) -> bytes:
     size = len(checksum_entry(b""))
     if data[-size:] == checksum_entry(data[:-size]):
         return data
-    manifest, checksums = file.with_name("manifest.json"), None
+    manifest = file.with_name("manifest.json")
+    checksums = None
     if manifest.is_file():
         content = read_json(manifest, "manifest of a policy")
         checksums = content.get("sha256") if isinstance(content, dict) else None
@@ -201,7 +202,8 @@ def _interface(file: str | Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         interface = PolicyInterface.from_json(fields).to_json()
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    layout, wide = interface["observation_layout"], ("angle", "rate", LAST_ACTION)
+    layout = interface["observation_layout"]
+    wide = ("angle", "rate", LAST_ACTION)
     if interface["joint_names"] != JOINTS:
         raise InputError(f"{file}: expected the joints {', '.join(JOINTS)}")
     if wrong := [name for name in wide if name in layout and _width(layout[name]) != len(JOINTS)]:
@@ -230,10 +232,12 @@ def limit_command(
         np.float32(math.radians(limits[name])) for name in ("lower", "upper", "lower_zone", "upper_zone")
     )
     floor = np.float32(math.radians(settings["speed_floor"]))
-    to_upper, to_lower = upper - pos, pos - lower
+    to_upper = upper - pos
+    to_lower = pos - lower
     time_to_limit = np.minimum(to_upper / np.maximum(vel, floor), to_lower / np.maximum(-vel, floor))
     weight = np.clip(1.0 - time_to_limit / np.float32(settings["horizon"]), 0.0, 1.0)
-    near_upper, near_lower = to_upper < upper_zone, to_lower < lower_zone
+    near_upper = to_upper < upper_zone
+    near_lower = to_lower < lower_zone
     weight = np.where(near_upper | near_lower, 0.0, weight)
     toward_limit = (near_upper & (command > pos)) | (near_lower & (command < pos))
     weight = np.where(toward_limit | (to_upper < 0.0) | (to_lower < 0.0), 1.0, weight)
@@ -254,7 +258,8 @@ class JumpCommand:
         if not isinstance(takeoff_speed, Real) or not 0.0 < takeoff_speed <= 20.0:
             raise InputError(f"takeoff_speed must be above 0 to 20 m/s, got {takeoff_speed!r:.40}")
         self._takeoff_speed = takeoff_speed
-        self.requested, self.in_flight = False, False
+        self.requested = False
+        self.in_flight = False
 
     def request(self) -> None:
         """Command a jump from the next `update` on."""
@@ -274,7 +279,8 @@ class JumpCommand:
             raise InputError(f"vertical_velocity must be within ±{fastest:g} m/s and paws_down 0 to 4, got {given}")
         rises = vertical_velocity > self._takeoff_speed
         if self.in_flight and paws_down > 0 and not rises:
-            self.requested, self.in_flight = False, False
+            self.requested = False
+            self.in_flight = False
         elif paws_down == 0 and rises:
             self.in_flight = True
         return float(self.requested)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, Eval
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 if TYPE_CHECKING:
@@ -25,7 +26,9 @@ HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
     """Return rotations by an angle [deg] about the axes of DIRECTIONS in cyclic order, quaternions (count, 4), xyzw."""
-    half, rows, quats = 0.5 * np.radians(angle), np.arange(count), np.zeros((count, 4))
+    half = 0.5 * np.radians(angle)
+    rows = np.arange(count)
+    quats = np.zeros((count, 4))
     quats[rows, rows % 6 // 2] = np.where(rows % 2 == 0, 1.0, -1.0) * np.sin(half)  # even rows: plus, odd: minus
     quats[:, 3] = np.cos(half)
     return quats
@@ -66,7 +69,7 @@ class AttitudeLog(EvaluationLog):
         self.step_dt = env.step_dt
         env.evaluation_reset(self.turns)
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the task's arrays and the base's angular velocity [rad/s] by name, for `update`.
 
         `Env.task_arrays`, and `base_ang_vel` (num_envs, 3), world axes.
@@ -128,10 +131,11 @@ class AttitudeLog(EvaluationLog):
 
     def series(self) -> dict[str, np.ndarray]:
         """Return the current angle to the goal [deg] and angular speed [rad/s] of all worlds; NaN is replaced by 0."""
-        error, speed = np.nan_to_num(self.errors[-1]), np.nan_to_num(self.angular_speeds[-1])
+        error = np.nan_to_num(self.errors[-1])
+        speed = np.nan_to_num(self.angular_speeds[-1])
         return {"error/angle to goal, {} [deg]": np.degrees(error), "spin/angular speed, {} [rad/s]": speed}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the commanded turns of some worlds, key `turns_xyzw`, quaternions."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
@@ -156,7 +160,8 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
     Keys: `<direction>_<key>` for DIRECTIONS; turns: log of `axis_turns`.
     """
     rows = chosen(TURN_METRICS, "settling_time_mean_s", "settled_without_collision_rate", "error_at_end_mean_deg")
-    number, metrics = np.arange(turns.count) % len(DIRECTIONS), {}
+    number = np.arange(turns.count) % len(DIRECTIONS)
+    metrics = {}
     for i, name in enumerate(DIRECTIONS):
         metrics |= measure(rows, turns, number == i, f"{name}_", name.replace("_", " "))
     return metrics

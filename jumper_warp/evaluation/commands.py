@@ -10,16 +10,17 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import tyro
 
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.scripts import read_script
-from jumper_warp.policies.catalog import find_policy, is_run_folder
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import SkillNames
+from jumper_warp.evaluation.skills import SkillNames
+from jumper_warp.policies.catalog import add_files, find_policy, is_run, run_folder
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import MetricValue
 from jumper_warp.utils.output import Report, write_metrics
 from jumper_warp.utils.summary import PrintFlags
@@ -51,7 +52,7 @@ class EvaluateCfg(Generic[Flags]):
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
 
 
-def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
+def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> Json:
     """Evaluate a policy, write `metrics.json`, print a summary, and return conditions and metrics by name.
 
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
@@ -59,8 +60,6 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     """
     from jumper_warp.evaluation.run import HEADLINES
     from jumper_warp.evaluation.trained import trained_success
-    from jumper_warp.policies.folder import add_files
-    from jumper_warp.policies.runs import is_run
     from jumper_warp.registry import TASKS
 
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
@@ -152,14 +151,17 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     from jumper_warp.evaluation.recorder import EnvRecorder
     from jumper_warp.evaluation.trained import warn_beyond_resets, warn_beyond_training
 
-    flags, name = cfg.flags, run.policy.interface.task
+    flags = cfg.flags
+    name = run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
     warn_beyond_training(run.task, log.all_commands())
-    env, worlds = run.env(log.count), range(log.count)
+    env = run.env(log.count)
+    worlds = range(log.count)
     notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, log, worlds, notes=notes)
-    seconds, stop = cfg.seconds or flags.length, cfg.seconds is None
+    seconds = cfg.seconds or flags.length
+    stop = cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):
@@ -172,8 +174,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 def played_name(source: str | Path) -> str:
     """Return the name of a policy for titles, or "run RUN" for the folder or a checkpoint of the training run RUN."""
-    folder = Path(source).parent.parent if Path(source).suffix == ".pt" else Path(source)
-    return f"run {folder.resolve().name}" if is_run_folder(folder) else folder.resolve().name
+    name = run_folder(Path(source)).resolve().name
+    return f"run {name}" if is_run(source) else name
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
     course = CourseLog([script])
-    course.warn_beyond_training(run.skills.tasks)
+    course.warn_beyond_training(run.tasks)
     env = run.env(1, block=course.block)
     notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)
@@ -221,7 +223,7 @@ def play_script(cfg: ScriptCfg) -> Path:
 
 def show_recording(
     run: Run, report: Report, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a recording (.rrd, picture, film if requested), print a summary, and return the path of the .rrd file.
 
     It opens the viewer that `cfg` names. report: written metrics of the run. name: of the files and of a trial; count,

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from jumper_warp.evaluation.jumps import updated_apex
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
     AXES,
@@ -28,14 +29,19 @@ from jumper_warp.evaluation.velocities import (
     square_sums,
     velocity_series,
 )
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
+from jumper_warp.utils.kernels import records
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
+    from jumper_warp.sim.solver import SolverJumper
 
 SKILLS = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
 """Skill of each kind of command."""
@@ -73,7 +79,8 @@ class CourseLog(EvaluationLog):
         self.target_skill = np.array([[SKILLS[step.kind] for step in script] for script in self.scripts])
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.durations = np.array([[step.seconds for step in script] for script in self.scripts])
-        self.count, self.step_dt = n, 1.0 / 60.0
+        self.count = n
+        self.step_dt = 1.0 / 60.0
         self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 until the end
         self.current = np.zeros(n, dtype=int)  # (robots,) index of the current command
         self.start_step = np.full(shape, -1)  # (robots, commands) policy step in which a command began, or -1
@@ -91,7 +98,9 @@ class CourseLog(EvaluationLog):
         self.skills: list[np.ndarray] = []  # (robots,) active skill
         self.height: list[np.ndarray] = []  # [m] (robots,) of the base
         self.force: list[np.ndarray] = []  # [N] (robots, 4) on each paw
-        self._skill, self._target_velocity, self._command = np.zeros(n, dtype=int), np.zeros((n, 3)), np.zeros((n, 3))
+        self._skill = np.zeros(n, dtype=int)
+        self._target_velocity = np.zeros((n, 3))
+        self._command = np.zeros((n, 3))
 
     @property
     def _at(self) -> np.ndarray:
@@ -114,7 +123,7 @@ class CourseLog(EvaluationLog):
             if (chosen := self.target_skill == skill).any():
                 warn_beyond_training(task, self.goal[chosen])
 
-    def begin(self, env: Any) -> None:
+    def begin(self, env: Env) -> None:
         """Reset every robot to the default pose at rest, and start its first command."""
         self.step_dt = env.step_dt
         first = np.where(self.target_skill[:, :1] == WALK, self.goal[:, 0], 0.0)
@@ -122,13 +131,14 @@ class CourseLog(EvaluationLog):
         env.evaluation_reset(self._command, self.headings)
         self._request_jumps(env, np.full(len(self.end), True))
 
-    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return by name what `update` records, (robots, ...): base, skill, termination, paw forces [N], jump state.
 
         Base position [m], quaternion (xyzw), velocity [m/s] and angular velocity [rad/s] are in world axes. `jump_`
         arrays are fields of the current command's jump skill, or of JUMP_UP while the robot walks.
         """
-        q, qd = env.sim.joint_q(), env.sim.joint_qd()
+        q = env.sim.joint_q()
+        qd = env.sim.joint_qd()
         arrays = {
             "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
             "base_vel": env.sim.base_velocity(), "skill": env.episodes.skill.numpy().copy(),
@@ -138,16 +148,20 @@ class CourseLog(EvaluationLog):
         rows = np.arange(len(q))
         kind = self.target_skill[rows, self._at]
         for name in ("goal", "phase", "took_off", "touched_down"):
-            by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
+            by_skill = [records(env.skills[skill].states)[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays
 
-    def record_step(self, env: Any) -> bool:
+    def record_step(self, env: Env) -> bool:
         """Record a policy step, then send each robot its next command if it is due; return whether all are done."""
-        before, previous = self.current.copy(), self._skill
+        before = self.current.copy()
+        previous = self._skill
         ended = super().record_step(env)
-        rows, at, running = np.arange(len(before)), self._at, self.end < 0
-        started, jumping = running & (self.current > before), self.target_skill[rows, at] != WALK
+        rows = np.arange(len(before))
+        at = self._at
+        running = self.end < 0
+        started = running & (self.current > before)
+        jumping = self.target_skill[rows, at] != WALK
         self._target_velocity[started] = np.where(jumping[started, None], 0.0, self.goal[rows, at][started])
         waited = (len(self.skills) - self.start_step[rows, at]) * self.step_dt
         waits = running & jumping & (self._skill == WALK) & (waited >= NUDGE_AFTER)
@@ -165,16 +179,17 @@ class CourseLog(EvaluationLog):
             self._place_blocks(env)
         return ended
 
-    def _place_blocks(self, env: Any) -> None:
+    def _place_blocks(self, env: Env) -> None:
         """Move the block under the goal of every robot that begins to jump onto one."""
         begins = np.flatnonzero((self.onto_block & (self.switch_step == len(self.skills))).any(axis=1))
         if len(begins):
-            goals = env.skills[JUMP_TO].states.numpy()["goal"][begins, :2]
-            env.sim.solver.place_blocks(goals, begins.tolist())
+            goals = records(env.skills[JUMP_TO].states)["goal"][begins, :2]
+            cast("SolverJumper", env.sim.solver).place_blocks(goals, begins.tolist())
 
-    def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
+    def _request_jumps(self, env: Env, worlds: np.ndarray) -> None:
         """Request the jump from those robots in `worlds`, (robots,) bool, whose current command is a jump."""
-        rows, at = np.arange(len(worlds)), self._at
+        rows = np.arange(len(worlds))
+        at = self._at
         for skill in (JUMP_UP, JUMP_TO):
             requested = worlds & (self.target_skill[rows, at] == skill)
             if requested.any():
@@ -187,15 +202,19 @@ class CourseLog(EvaluationLog):
         A walk finishes after its time, a jump when its skill hands over to another. A jump without a takeoff, or
         unfinished JUMP_TIMEOUT seconds after its request, ends the course as STUCK.
         """
-        self.step_dt, last = step_dt, self.target_skill.shape[1] - 1
-        skill, previous, step = arrays["skill"], self._skill, len(self.skills) + 1
+        self.step_dt = step_dt
+        last = self.target_skill.shape[1] - 1
+        skill = arrays["skill"]
+        previous = self._skill
+        step = len(self.skills) + 1
         running = self.end < 0
         self._append_history(arrays, running, previous, step)
         fell = running & (arrays["termination"] >= 0)
         self.end[fell] = arrays["termination"][fell]
         row = np.flatnonzero(running & ~fell)
         at = (row, self.current[row])
-        kind, since = self.target_skill[at], step - self.start_step[at]
+        kind = self.target_skill[at]
+        since = step - self.start_step[at]
         jumps = kind != WALK
         entered = jumps & (skill[row] == kind) & (previous[row] != kind)
         self.switch_step[row[entered], self.current[row[entered]]] = step
@@ -231,8 +250,10 @@ class CourseLog(EvaluationLog):
         arrays: those of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill
         that was active in the step; step: its number, from 1.
         """
-        rows, at = np.arange(len(running)), self._at
-        alive, walking = running[:, None], (previous == WALK)[:, None]
+        rows = np.arange(len(running))
+        at = self._at
+        alive = running[:, None]
+        walking = (previous == WALK)[:, None]
         self.velocity.append(np.where(alive, body_velocity(arrays), np.nan).astype(np.float32))
         self.commands.append(np.where(alive & walking, self._command, np.nan).astype(np.float32))
         settled = step - self.start_step[rows, at] > round(SETTLING_TIME / self.step_dt)
@@ -291,7 +312,7 @@ class CourseLog(EvaluationLog):
         goals = np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))
         return {"goals": goals, "commands": np.nan_to_num(self.commands[-1])}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the scripts of some robots, key `scripts`, lists of [kind, *values]."""
         return {"scripts": [[[step.kind, *step.values] for step in self.scripts[world]] for world in worlds]}
 
@@ -310,7 +331,8 @@ def course_metrics(course: CourseLog) -> Metrics:
     commands, without the first second after each.
     """
     jumps = course.target_skill != WALK
-    made, switched = jumps & (course.takeoff_step >= 0), jumps & (course.switch_step >= 0)
+    made = jumps & (course.takeoff_step >= 0)
+    switched = jumps & (course.switch_step >= 0)
     finished = course.outcomes == "done"
     error = np.array(course.velocity, dtype=float) - np.array(course.commands, dtype=float)
     error[~np.array(course.is_tracked)] = np.nan
@@ -347,7 +369,9 @@ def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
     Variation: peak-to-peak force over the last FORCE_WINDOW seconds before the handover, (handovers,); change: between
     the policy steps before and after it, without a handover in the last step. Each is the maximum over the four paws.
     """
-    force, ripples, steps = np.array(course.force, dtype=float), [], []
+    force = np.array(course.force, dtype=float)
+    ripples = []
+    steps = []
     window = round(FORCE_WINDOW / course.step_dt)
     for world, command in zip(*np.nonzero(course.switch_step >= 0), strict=True):
         last = course.switch_step[world, command]  # the last policy step of walking, counted from 1

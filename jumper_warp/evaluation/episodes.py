@@ -13,6 +13,7 @@ import numpy as np
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, check, ended_by, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.checks import FLOAT32_MAX
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 
 if TYPE_CHECKING:
@@ -41,9 +42,11 @@ class EpisodeLog(EvaluationLog):
 
     def __post_init__(self) -> None:
         self.count = count = len(self.commands)
-        self.end, self.length = np.full(count, -1), np.zeros(count)
+        self.end = np.full(count, -1)
+        self.length = np.zeros(count)
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
-        self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
+        self._height_sum = np.zeros(count)
+        self._steps = np.zeros(count, dtype=int)
         self._start: dict[str, np.ndarray] = {}  # Sampled numbers of the task's state at the start, (num_envs,) each
         own: Any = self.task.evaluation  # an `EpisodeEvaluation`
         self.metrics, self.goal_marker = own.metrics, own.goal_marker
@@ -132,7 +135,7 @@ class EpisodeLog(EvaluationLog):
         commands = [command_text(self.task, self.commands[world]) for world in worlds]
         return [f"{title}, {command}" for title, command in zip(titles, commands, strict=True)]
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: the commands of some worlds, key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
@@ -178,7 +181,9 @@ def episode_metrics(episodes: EpisodeLog, count: int | None = None) -> Metrics:
 
     `ended_by_<outcome>_rate` is the rate of a termination. count: number of episodes to measure (default: all).
     """
-    running, over, displacement = episodes.end[:count] < 0, "episodes", episodes.displacement[:count]
+    running = episodes.end[:count] < 0
+    over = "episodes"
+    displacement = episodes.displacement[:count]
     success, timed_out = (episodes.ended_with(option)[:count] for option in ("success", "time_out"))
     return {
         "success_termination_rate": rate(success, over),

@@ -12,15 +12,14 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
 
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
 from jumper_warp.policies.policy import Policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.robot.overlay import load_overlay
@@ -30,6 +29,7 @@ from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import git_commit
 from jumper_warp.utils.streams import purpose_seed
@@ -48,7 +48,8 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     Empty groups are left out. Goals are evenly spaced over the range in `cfg`. recipe: of the policy.
     Raises InputError: the policy does not jump.
     """
-    rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
+    rng = np.random.default_rng(purpose_seed("tuning", cfg.seed))
+    groups = []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
         return task.evaluation.prepare_task(task).on_level_ground()
@@ -67,9 +68,13 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     for name, count, std, randomize, change_task in kinds:
         if count:
             conditions = Conditions(
-                randomize=randomize, noise=name == "randomized", seed=cfg.seed, stream="tuning", device=cfg.device,
+                randomize=randomize,
+                noise=name == "randomized",
+                seed=cfg.seed,
+                stream="tuning",
+                device=cfg.device,
                 threads=cfg.threads,
-            )  # fmt: skip
+            )
             robot = conditions.overlay(recipe.robot)
             if robot is not None and name == "late":
                 own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}
@@ -93,7 +98,8 @@ def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg:
     Observations are sampled from the first TRUST_REGION_SECONDS; after touchdown the allowed change of the actions is
     `cfg.landing_std`, before it `cfg.action_std`.
     """
-    observations, landed = [], []
+    observations = []
+    landed = []
     for group in groups:
         group.begin()
         with torch.no_grad():
@@ -153,14 +159,16 @@ def correct_aim(
         new_cost, new_errors, means = measure(aimed)
         if not new_cost < cost:
             break
-        policy, cost, errors = aimed, new_cost, new_errors
+        policy = aimed
+        cost = new_cost
+        errors = new_errors
         history.append(means)
     return policy, history
 
 
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     """Reduce the errors of jumps by Gauss-Newton steps on the network's weights, in place; return errors by step.
 
     Returns one record before the steps and one per step.
@@ -177,7 +185,8 @@ def tune_weights(
         return total + anchor.cost(network.weights), errors
 
     cost, errors = measure(cfg.iterations > 0)
-    damping, history = DAMPING, []
+    damping = DAMPING
+    history = []
     for step in range(cfg.iterations + 1):
         row = {"step": step, "mean_abs_miss_m": mean_abs_errors(groups, errors), "cost": cost,
                "action_change": anchor.change(network.weights), "seconds": time.perf_counter() - begin}  # fmt: skip
@@ -188,13 +197,17 @@ def tune_weights(
             break
         previous = network.weights
         importance = [group.importance(e) for group, e in zip(groups, errors, strict=True)]
-        jacobians, values = [e.jacobian for e in errors], [e.value for e in errors]
+        jacobians = [e.jacobian for e in errors]
+        values = [e.value for e in errors]
         network.weights = previous + gauss_newton_step(previous, jacobians, values, importance, anchor, damping)
         new_cost, new_errors = measure(step + 1 < cfg.iterations)
         if math.isfinite(new_cost) and new_cost < cost:
-            cost, errors, damping = new_cost, new_errors, damping / 3.0
+            cost = new_cost
+            errors = new_errors
+            damping = damping / 3.0
         else:
-            network.weights, damping = previous, 10.0 * damping
+            network.weights = previous
+            damping = 10.0 * damping
     return history
 
 
@@ -208,7 +221,8 @@ def finetune(
     `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """
     begin = time.perf_counter()
-    recipe, config = policy.recipe(modules), policy.config
+    recipe = policy.recipe(modules)
+    config = policy.config
     if cfg.robot is not None:
         robot = load_overlay(cfg.robot)
         recipe = replace(recipe, robot=robot)

@@ -77,22 +77,29 @@ def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Te
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
     worlds = torch.arange(len(steps), device=steps.device)
     pos, vel = pos[steps, worlds], vel[steps, worlds]
-    g, drop = loop.task.gravity, (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)
+    g = loop.task.gravity
+    drop = (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)
     fall_time = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * drop).sqrt()) / g
     return [pos[:, i] + fall_time * vel[:, i] for i in range(2)]
 
 
 def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
     """Simulate the jumps of a group under a network's actions, and return their errors; derivatives: with Jacobian."""
-    env, loop, to_height = group.env, group.loop, group.to_height
+    env = group.env
+    loop = group.loop
+    to_height = group.to_height
     group.begin()
-    begin, last = int(group.commands[:, 3].min()), int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)
+    begin = int(group.commands[:, 3].min())
+    last = int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)
     with torch.no_grad():
         for _ in range(begin):
             env.step(network.act(env.obs))
-    state, states, tape = loop.state(), [], Tape()
+    state = loop.state()
+    states = []
+    tape = Tape()
     arrays: dict[str, np.ndarray] = {}
-    apex, apex_step = np.full(len(group.commands), np.nan), np.zeros(len(group.commands), dtype=np.int64)
+    apex = np.full(len(group.commands), np.nan)
+    apex_step = np.zeros(len(group.commands), dtype=np.int64)
     with phase(f"simulating {len(group.commands)} {group.name} jumps", last - begin) as advance:
         for _ in range(begin, last):
             if derivatives:
@@ -101,7 +108,8 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
                 env.step(network.act(env.obs))
                 state = loop.state()
             states.append(state)
-            arrays, earlier = env.task_arrays(), apex
+            arrays = env.task_arrays()
+            earlier = apex
             apex = updated_apex(earlier, arrays)
             apex_step[apex != earlier] = len(states) - 1
             if ((arrays["phase"] == LANDED) | (apex - arrays["base_pos"][:, 2] > DESCENT)).all():

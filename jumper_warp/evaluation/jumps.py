@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ def updated_apex(apex: np.ndarray, jump: dict[str, np.ndarray]) -> np.ndarray:
     stays. jump: arrays (n, ...) of the step.
     """
     begins = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
-    flies, height = (jump["phase"] != LANDED) | (jump["touched_down"] == 1), jump["base_pos"][:, 2]
+    flies = (jump["phase"] != LANDED) | (jump["touched_down"] == 1)
+    height = jump["base_pos"][:, 2]
     return np.where(begins, height, np.where(flies, np.fmax(apex, height), apex))
 
 
@@ -132,8 +134,11 @@ class JumpOutcome:
 
 def jump_outcome(jumps: JumpLog) -> JumpOutcome:
     """Compute events and errors of the jumps that a log has recorded."""
-    ends, to_height, commanded = jumps.ends, jumps.goals[..., 2] > 0.0, jumps.ends != NOT_BEGUN
-    landed, diverged = ends == SUCCESS, ends == DIVERGED
+    ends = jumps.ends
+    to_height = jumps.goals[..., 2] > 0.0
+    commanded = jumps.ends != NOT_BEGUN
+    landed = ends == SUCCESS
+    diverged = ends == DIVERGED
 
     def known(values: np.ndarray) -> np.ndarray:
         """Return the values, with NaN where the simulation diverged."""
@@ -144,23 +149,41 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         return known(np.linalg.norm(position - jumps.goal_world, axis=-1))
 
     ahead, left = np.moveaxis(turn_plane(jumps.rest_position - jumps.goal_world, -jumps.heading), -1, 0)
-    apex_error, distance_at_rest = known(jumps.apex - jumps.goals[..., 2]), goal_distance(jumps.rest_position)
+    apex_error = known(jumps.apex - jumps.goals[..., 2])
+    distance_at_rest = goal_distance(jumps.rest_position)
     off = np.where(to_height, np.abs(apex_error), distance_at_rest)
     reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
     at_rest = landed & (jumps.rest_speed < REST_SPEED)
     return JumpOutcome(
-        commanded=commanded, to_height=to_height, early=jumps.early & commanded, reached=reached, landed=landed,
-        touched_down=np.isfinite(jumps.touchdown[..., 0]), at_rest=at_rest, success=reached & at_rest & ~jumps.early,
-        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS), hopped=jumps.air_time > HOP_TIME + TIME_EPS,
-        took_off_again=jumps.takeoffs > 0, fell=np.isin(ends, FALLS), collided=ends == COLLIDED, diverged=diverged,
-        missed=landed & ~reached, no_jump=ends == "no_jump", apex_m=known(jumps.apex),
-        apex_error_m=np.where(to_height, apex_error, np.nan), distance_at_end_m=goal_distance(jumps.end_position),
-        distance_at_touchdown_m=goal_distance(jumps.touchdown), distance_at_rest_m=distance_at_rest,
-        ahead_m=known(ahead), left_m=known(left), drift_m=known(jumps.drift),
+        commanded=commanded,
+        to_height=to_height,
+        early=jumps.early & commanded,
+        reached=reached,
+        landed=landed,
+        touched_down=np.isfinite(jumps.touchdown[..., 0]),
+        at_rest=at_rest,
+        success=reached & at_rest & ~jumps.early,
+        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS),
+        hopped=jumps.air_time > HOP_TIME + TIME_EPS,
+        took_off_again=jumps.takeoffs > 0,
+        fell=np.isin(ends, FALLS),
+        collided=ends == COLLIDED,
+        diverged=diverged,
+        missed=landed & ~reached,
+        no_jump=ends == "no_jump",
+        apex_m=known(jumps.apex),
+        apex_error_m=np.where(to_height, apex_error, np.nan),
+        distance_at_end_m=goal_distance(jumps.end_position),
+        distance_at_touchdown_m=goal_distance(jumps.touchdown),
+        distance_at_rest_m=distance_at_rest,
+        ahead_m=known(ahead),
+        left_m=known(left),
+        drift_m=known(jumps.drift),
         distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
         paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
-        tilt_deg=known(np.degrees(jumps.tilt)), turn_deg=known(np.degrees(np.abs(jumps.yaw))),
-    )  # fmt: skip
+        tilt_deg=known(np.degrees(jumps.tilt)),
+        turn_deg=known(np.degrees(np.abs(jumps.yaw))),
+    )
 
 
 class JumpLog(EvaluationLog):
@@ -193,8 +216,11 @@ class JumpLog(EvaluationLog):
             goals = goals[:, None, None] * [0.0, 0.0, 1.0]
         fits = goals.ndim == 3 and goals.shape[2] in (2, 3)
         check(fits, f"goals must have shape (num_envs,) or (num_envs, jumps, 2 or 3), got {goals.shape}")
-        self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
-        self.headings, self.delay, self.rest = headings, delay, rest
+        self.goals = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2])))
+        self.terminations = terminations
+        self.headings = headings
+        self.delay = delay
+        self.rest = rest
         self.to_heights = bool((self.goals[..., 2] > 0.0).all())  # whether all goals are apex heights
         places = ("goal_x_m", "goal_y_m", "distance_at_rest_m", "apex_m")
         heights = ("goal_height_m", "apex_m", "apex_error_m")
@@ -221,9 +247,11 @@ class JumpLog(EvaluationLog):
         self.air_time = np.zeros(shape)  # [s] longest time with no paw on the ground after touchdown
         self.lift_time = np.zeros(shape)  # [s] longest time off the ground of a paw after its own first contact
         self.takeoffs = np.zeros(shape, dtype=int)  # second takeoffs: upward at TAKEOFF_SPEED with no paw down
-        self._air_time, self._paw_air_time = np.zeros(self.count), np.zeros((self.count, 4))
+        self._air_time = np.zeros(self.count)
+        self._paw_air_time = np.zeros((self.count, 4))
         self._paw_start = np.full((self.count, 4, 2), np.nan)  # [m] last contacts before takeoff
-        self._paw_touched, self._rising_flight = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
+        self._paw_touched = np.zeros((self.count, 4), dtype=bool)
+        self._rising_flight = np.zeros(self.count, dtype=bool)
         names = ", ".join(terminations)
         check(SUCCESS in terminations, f"the evaluation needs a termination {SUCCESS!r}, the task has {names}")
         self._success = terminations.index(SUCCESS)
@@ -269,7 +297,8 @@ class JumpLog(EvaluationLog):
         self.heading[at] = jump["heading"]
         self.yaw[at] = wrapped(yaw_of(jump["base_quat"]) - jump["heading"])
         self.drift[at] = np.linalg.norm((jump["base_pos"] - jump["start"])[:, :2], axis=1)
-        landed, self.tilt[at] = jump["phase"] == LANDED, jump["peak_tilt"]
+        landed = jump["phase"] == LANDED
+        self.tilt[at] = jump["peak_tilt"]
         self.apex[at] = updated_apex(self.apex[at], jump)
         self._record_landing(jump, at, landed, step_dt)
         failed = (jump["termination"] >= 0) & (jump["termination"] != self._success)
@@ -288,8 +317,10 @@ class JumpLog(EvaluationLog):
         these jumps; landed: (n,) whether each has touched down; step_dt [s]: policy step.
         """
         row, number = at
-        steps, speed = jump["phase_steps"], np.linalg.norm(jump["base_vel"], axis=1)
-        at_rest, position = landed & (steps == round(min(self.rest, REST_TIME) / step_dt)), jump["base_pos"][:, :2]
+        steps = jump["phase_steps"]
+        speed = np.linalg.norm(jump["base_vel"], axis=1)
+        at_rest = landed & (steps == round(min(self.rest, REST_TIME) / step_dt))
+        position = jump["base_pos"][:, :2]
         for record, due, values in (
             (self.takeoff, jump["took_off"] == 1, position),
             (self.touchdown, landed & (jump["touched_down"] == 1), position),
@@ -297,7 +328,8 @@ class JumpLog(EvaluationLog):
             (self.rest_speed, at_rest, speed),
         ):
             record[row[due], number[due]] = values[due]
-        down, pushing = landed[:, None] & jump["paws_down"], (jump["phase"] == STANCE) | (jump["took_off"] == 1)
+        down = landed[:, None] & jump["paws_down"]
+        pushing = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
         standing = (pushing[:, None] & jump["paws_down"])[..., None]
         self._paw_start[row] = np.where(standing, jump["paw_pos"], self._paw_start[row])
         first = (down & ~self._paw_touched[row])[..., None]
@@ -366,7 +398,7 @@ class JumpLog(EvaluationLog):
             return {"heights": self.goals[:, 0, 2]}
         return {"goals": np.pad(self.goal_world, ((0, 0), (0, 0), (0, 1)))}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: goals [m] of some worlds, heights as `targets_m`, places as `goals_m`."""
         goals = self.goals[list(worlds)]
         return {"targets_m": goals[:, 0, 2].tolist()} if self.to_heights else {"goals_m": goals[..., :2].tolist()}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
 from jumper_warp.utils.progress import phase
 
@@ -23,7 +24,7 @@ LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
 PUSH_PROBABILITY = "events.push.probability"
 
 
-def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
+def open_loop_limits(env: Env, initial_state: Json) -> np.ndarray:
     """Simulate the open-loop jump of each robot; return the largest base heights [m], (num_envs,), NaN if diverged.
 
     The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes.
@@ -38,7 +39,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
     if PUSH_PROBABILITY in params.names:
         env.set(PUSH_PROBABILITY, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
+    apex = np.zeros(env.num_envs)
+    diverged = np.zeros(env.num_envs, dtype=bool)
     with phase(f"simulating {env.num_envs} open-loop jumps", len(LEVELS)) as advance:
         for step, level in enumerate(LEVELS.tolist()):
             env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))

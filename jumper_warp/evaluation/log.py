@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, rate
 from jumper_warp.utils.progress import phase
 
@@ -89,12 +90,12 @@ class EvaluationLog(ABC):
             label if labels.count(label) == 1 else f"{label}, {self.row_name} {world + 1}" for label, world in pairs
         ]
 
-    def named(self, values: Mapping[str, Any], worlds: Sequence[int]) -> dict[str, Any]:
+    def named(self, values: Mapping[str, Any], worlds: Sequence[int]) -> Json:
         """Select some worlds' entries of `series` or `states`, with the world's name in each key in place of {}."""
         names = list(zip(self.names(worlds), worlds, strict=True))
         return {key.format(name): values[key][world] for name, world in names for key in values}
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return the metadata, JSON values by key, that a recording of some worlds (indices) saves."""
         return {}
 

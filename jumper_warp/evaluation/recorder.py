@@ -30,9 +30,15 @@ class EnvRecorder:
     """Recorder of some worlds of an environment; call the object after every policy step to add a frame."""
 
     def __init__(
-        self, env: Env, log: EvaluationLog, worlds: Sequence[int], *, ground: Any = "plane",
-        block: BlockCfg | None = None, notes: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        env: Env,
+        log: EvaluationLog,
+        worlds: Sequence[int],
+        *,
+        ground: Any = "plane",
+        block: BlockCfg | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
         """Prepare an empty recording of worlds (indices, at least one) of the environment.
 
         log: supplies series, states, commands, labels and goals; ground: as in `build_model`; block: the environment's
@@ -41,10 +47,13 @@ class EnvRecorder:
         from jumper_warp.robot.model import build_model
         from jumper_warp.viz.recorder import Recorder
 
-        self.env, self.log, self.worlds = env, log, list(worlds)
+        self.env = env
+        self.log = log
+        self.worlds = list(worlds)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
         model = build_model(len(worlds), ground=ground, device=env.wp_device, mujoco=False)
-        labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
+        labels = log.names(self.worlds)
+        notes = {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)
@@ -52,7 +61,8 @@ class EnvRecorder:
 
     def __call__(self) -> None:
         """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
-        sim, log = self.env.sim, self.log
+        sim = self.env.sim
+        log = self.log
         poses = sim.links()[0][self.worlds]
         forces = peak_forces(sim)[self.worlds]
         if self.block is not None:
@@ -60,9 +70,14 @@ class EnvRecorder:
         self.frames += 1
         series = log.named(log.series(), self.worlds) | self._motor_series()
         self.recorder.record(
-            self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces,
-            states=log.named(log.states(), self.worlds), commands=self._marks().get("commands"),
-        )  # fmt: skip
+            self.frames * self.env.step_dt,
+            poses.reshape(-1, 7),
+            series,
+            ankles(poses),
+            forces,
+            states=log.named(log.states(), self.worlds),
+            commands=self._marks().get("commands"),
+        )
 
     def _marks(self) -> dict[str, np.ndarray]:
         """Return goals, heights and commands of the recorded worlds, which the log's `marks` gives."""
@@ -73,8 +88,10 @@ class EnvRecorder:
 
         Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
         """
-        world, sim = self.worlds[0], self.env.sim
-        peak, torque = sim.peak_paw_force.numpy()[:, world], sim.torque.numpy()[:, world]
+        world = self.worlds[0]
+        sim = self.env.sim
+        peak = sim.peak_paw_force.numpy()[:, world]
+        torque = sim.torque.numpy()[:, world]
         action = self.env.action[world].cpu().numpy()
         series = {f"peak paw force/{leg} [N]": peak[i] for i, leg in enumerate(LEGS)}
         series |= {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -16,18 +16,22 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 import tyro
 
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe, shared_robot
 from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.skills import WALK, SkillNames
 from jumper_warp.evaluation.trained import trained_range
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
-from jumper_warp.tasks.jump.evaluation import PlaceEvaluation
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.overlay_ranges import range_words
+from jumper_warp.tasks.switching import skills_and_handovers
+from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.arrays import write_npz
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import Report, output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -70,7 +74,7 @@ class EvaluationArgs(Conditions, PrintFlags):
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
     """Return the test conditions from an experiment's flags; randomised robots have observation noise."""
-    values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
+    values: Json = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
     values["noise"] = args.randomize
     return Conditions(**values)
 
@@ -86,10 +90,12 @@ class Run(ABC):
         from jumper_warp.robot.model import PHYSICS_DT
 
         self.started = time.perf_counter()
-        self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
+        self.conditions = Conditions()  # Conditions of all episodes
+        self.record = 0  # Number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
-        self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
-        self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
+        self.name = ""  # Name of the evaluation
+        self.print_flags = PrintFlags()  # Selects what `report` prints
+        self.settings: Json = {}  # Settings of task, robot and test, reported with the conditions
         self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -117,7 +123,10 @@ class Run(ABC):
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials, self.name = conditions, record, save_trials, name
+        self.conditions = conditions
+        self.record = record
+        self.save_trials = save_trials
+        self.name = name
         self.folder = output_dir(name, out)
 
     @property
@@ -136,9 +145,10 @@ class Run(ABC):
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
-    def condition_values(self) -> dict[str, Any]:
+    def condition_values(self) -> Json:
         """Conditions of the evaluation by name, without unset ones; with the latencies of the episodes so far."""
-        conditions, values = self.conditions, {**self.settings}
+        conditions = self.conditions
+        values = {**self.settings}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
@@ -147,7 +157,10 @@ class Run(ABC):
         values |= {} if conditions.sensor_offset is None else {"sensor_offset_deg": conditions.sensor_offset}
         values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
-            values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)
+            steps = np.concatenate(self._latency)
+            values |= {} if conditions.latency is None else {"latency_requested_ms": conditions.latency}
+            values["latency_ms"] = 1000.0 * self._physics_dt * float(np.mean(steps))
+            values["latency"] = latency_text(steps, self._physics_dt)
         return values
 
     def note_robot(self, env: Env) -> None:
@@ -161,15 +174,21 @@ class Run(ABC):
             self.settings["ranges"] = range_words(env.task, env.overlay)
 
     def run_episodes(
-        self, env: Env, log: Log, *, film: str = "", film_scene: Mapping[str, Any] | None = None,
+        self,
+        env: Env,
+        log: Log,
+        *,
+        film: str = "",
+        film_scene: Mapping[str, Any] | None = None,
         on_step: Callable[[Log], None] | None = None,
-    ) -> Log:  # fmt: skip
+    ) -> Log:
         """Run one episode per world with the commands of a log, and return the log.
 
         film: name of the recording and picture of `record` evenly spaced worlds; empty: none. film_scene: the
         environment's `ground` and `block` for the recording. on_step: called with the log after every policy step.
         """
-        recorder, scene = None, film_scene or {}
+        recorder = None
+        scene = film_scene or {}
         if film and self.record:
             worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
             recorder = EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
@@ -195,15 +214,14 @@ class Run(ABC):
 
     def summarise(self, report: Report, count: str, keys: Iterable[str], **settings: Any) -> None:
         """Print a summary of a report; count: number and kind of trials; settings: see `print_summary`."""
-        name, count = self.name.replace("_", " "), f"{count}, " if count else ""
+        name = self.name.replace("_", " ")
+        count = f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
         what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
         print_summary(report, what, keys, flags=self.print_flags, seconds=seconds, **settings)
 
-    def report(
-        self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
-    ) -> dict[str, Any]:  # fmt: skip
+    def report(self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES) -> Json:
         """Write all metrics to `metrics.json`, print those with the given keys, and return all values by name."""
         written = self.write(metrics)
         ends = [key for key in metrics if key.startswith("ended_by_")]
@@ -227,9 +245,9 @@ class EvaluationRun(Run):
         """
         super().__init__()
         self.source = source
-        from jumper_warp.policies.runs import open_policy
+        from jumper_warp.policies.policy import Policy
 
-        self.policy = open_policy(source)
+        self.policy = Policy.load(source)
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
         self.evaluation = self.task.evaluation
@@ -237,9 +255,12 @@ class EvaluationRun(Run):
 
     @classmethod
     def from_args(
-        cls, name: str, args: EvaluationArgs, kind: type[Evaluation] = PlaceEvaluation,
+        cls,
+        name: str,
+        args: EvaluationArgs,
+        kind: type[Evaluation] = PlaceEvaluation,
         modules: Iterable[ModuleType] = (),
-    ) -> EvaluationRun:  # fmt: skip
+    ) -> EvaluationRun:
         """Return a prepared evaluation of the policy `args.policy` with the flags of an experiment.
 
         name: of the output folder; kind: class of the task's evaluation, else PolicyError; modules: the user's task
@@ -256,15 +277,19 @@ class EvaluationRun(Run):
         return self.policy.act
 
     def env(
-        self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, conditions: Conditions | None = None,
+        self,
+        count: int,
+        change: Callable[[TaskCfg], TaskCfg] | None = None,
+        conditions: Conditions | None = None,
         **scene: Any,
-    ) -> Env:  # fmt: skip
+    ) -> Env:
         """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_recipe`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
         """
-        change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
+        change = change or self.evaluation.prepare_task
+        conditions = conditions or self.conditions
         env = env_of_recipe(self.recipe, count, conditions, change=change, **scene)
         self.policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
@@ -274,23 +299,56 @@ class EvaluationRun(Run):
 
 
 class SkillRun(Run):
-    """Evaluation of three policies (walk, jump up, jump to) on one robot."""
+    """Evaluation of three policies (WALK, JUMP_UP, JUMP_TO) on one robot, which switches between them.
+
+    policies, recipes, tasks: of the skills. skills: tasks in the conditions of the last `env`.
+    """
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Load the policies; call `prepare` before any other method. Raises PolicyError or CheckpointError."""
+        """Load the policies; call `prepare` before any other method.
+
+        Raises PolicyError or CheckpointError: one cannot be used, or is for another kind of skill.
+        """
         super().__init__()
-        self.skills = SkillPolicies(names)
+        from jumper_warp.policies.policy import Policy
+
+        self.names = astuple(names or SkillNames())
+        self.policies = [Policy.load(name) for name in self.names]
+        self.recipes = [policy.recipe() for policy in self.policies]
+        self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
+        self.skills = self.tasks
+        for task, kind in zip(self.tasks, (VelocityEvaluation, HeightEvaluation, PlaceEvaluation), strict=True):
+            if not isinstance(task.evaluation, kind):
+                raise PolicyError(f"expected a policy of a task with a {kind.__name__}, got one of {task.name}")
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return a function that computes the actions of all skills, (skills, num_envs, 12), from the state of `env`.
 
         Its argument is ignored: every skill reads its own observation of `env`.
         """
-        return lambda obs: self.skills.act(env)
+        import torch
+
+        pairs = list(zip(self.policies, env.skills, strict=True))
+        return lambda obs: torch.stack([policy.act(skill.obs["actor"]) for policy, skill in pairs])
 
     def env(self, count: int, **scene: Any) -> Env:
-        """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, e.g. `block`."""
-        env = self.skills.env(count, self.conditions, **scene)
+        """Return an environment of `count` robots that start with WALK, and move the policies to its device.
+
+        The robot has the overlay (changed parameters) of the policies' training. scene: further arguments of `Env`,
+        e.g. `block`. Raises PolicyError: policies were trained with different overlays, or the tasks do not fit.
+        """
+        from jumper_warp.envs.env import Env
+
+        walk, *jumps = (self.conditions.applied(task) for task in self.tasks)
+        try:
+            self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
+        except InputError as error:
+            raise PolicyError(str(error)) from error
+        robots = {name: recipe.robot for name, recipe in zip(self.names, self.recipes, strict=True)}
+        settings = self.conditions.env_settings(shared_robot(robots, self.conditions))
+        env = Env(self.skills, count, skill=WALK, handovers=handovers, **settings, **scene)
+        for policy in self.policies:
+            policy.to(env.device)
         self.note_robot(env)
         return env
 
@@ -304,20 +362,10 @@ def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:
     write_npz(folder / ("trials.npz" if number == 1 else f"trials_{number}.npz"), **columns)
 
 
-def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
-    """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_requested_ms`.
-
-    steps: latency of all worlds [physics steps], (num_envs,); physics_dt: physics step [s]; requested [ms]: value of
-    the flag `--latency`; None: omit `latency_requested_ms`.
-    """
-    values: dict[str, Any] = {} if requested is None else {"latency_requested_ms": requested}
-    mean = 1000.0 * physics_dt * float(np.mean(steps))
-    return values | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
-
-
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
     """Format latencies (num_envs,) [physics steps of physics_dt s] in ms and steps: one value, or range and mean."""
-    least, most = int(np.min(steps)), int(np.max(steps))
+    least = int(np.min(steps))
+    most = int(np.max(steps))
     low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
     if least == most:
         return f"{low} ms ({least} physics step{'' if least == 1 else 's'})"

@@ -7,15 +7,13 @@ A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jumper_warp.evaluation.log import check
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json
+from jumper_warp.utils.files import Json, read_json
 
 KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
@@ -61,40 +59,31 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
     """Convert JSON data to the commands of a script. Raises InputError: malformed, too many or too long commands."""
     if not isinstance(content, list) or not 1 <= len(content) <= MAX_COMMANDS:
         raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
-    steps = tuple(_step(i, item) for i, item in enumerate(content))
+    steps = []
+    for number, item in enumerate(content, start=1):
+        try:
+            steps.append(_step(item))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"command {number}, {item!s:.60}: {error}") from error
     total = sum(step.seconds for step in steps)
     check(total <= MAX_SECONDS, f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
-    return steps
+    return tuple(steps)
 
 
-def _step(index: int, item: Any) -> ScriptStep:
-    """Convert a JSON object to a command; index: its place in the script, from 0. Raises InputError: malformed."""
-    where = f"command {index + 1}"
-    kinds = [key for key in item if key in KINDS] if isinstance(item, dict) else []
-    if len(kinds) != 1:
-        raise InputError(f"{where} must have one of {', '.join(KINDS)}, got {item!s:.60}")
-    kind = kinds[0]
-    unknown = set(item) - {kind} - ({"seconds"} if kind == "walk" else set())
-    if unknown:
-        raise InputError(f"{where}: {kind} has no {sorted(map(str, unknown))[0]!r:.40}")
-    value = item[kind]
-    values = _numbers(f"{where}: {kind}", value if isinstance(value, list) else [value], KINDS[kind], LIMITS[kind])
+def _step(item: Json) -> ScriptStep:
+    """Convert a JSON object to a command. Raises TypeError or ValueError: it is malformed."""
+    kind = next((kind for kind in KINDS if kind in item), None)
+    check(kind is not None, f"a command must have one of {', '.join(KINDS)}")
+    assert kind is not None
+    unknown = sorted(set(item) - {kind} - ({"seconds"} if kind == "walk" else set()))
+    check(not unknown, f"{kind} has no {', '.join(unknown)}")
+    given = item[kind] if isinstance(item[kind], list) else [item[kind]]
+    values = tuple(float(value) for value in given)
+    fits = len(values) == KINDS[kind] and all(abs(value) <= LIMITS[kind] for value in values)
+    check(fits, f"{kind} takes {KINDS[kind]} numbers within {LIMITS[kind]:g}")
     if kind.startswith("jump"):
-        check(kind != "jump_up" or values[0] > 0.0, f"{where}: jump_up needs a positive height [m], got {values[0]:g}")
+        check(kind != "jump_up" or values[0] > 0.0, "jump_up needs a positive height [m]")
         return ScriptStep(kind, values)
-    time = values[0] if kind == "stand" else item.get("seconds", 2.0)
-    (seconds,) = _numbers(f"{where}: seconds", [time], 1, MAX_SECONDS)
-    check(seconds > 0.0, f"{where}: seconds must be positive, got {seconds:g}")
+    seconds = values[0] if kind == "stand" else float(item.get("seconds", 2.0))
+    check(0.0 < seconds <= MAX_SECONDS, f"seconds must be positive and at most {MAX_SECONDS:g}")
     return ScriptStep(kind, values if kind == "walk" else (0.0, 0.0, 0.0), seconds)
-
-
-def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
-    """Check and return the numbers of a script's command: `count` finite floats within ±most.
-
-    where: prefix of messages. Raises InputError.
-    """
-    good = len(values) == count and all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
-    )
-    check(good, f"{where} takes {count} number{'s' * (count > 1)} within {most:g}, got {values!s:.60}")
-    return tuple(float(v) for v in values)

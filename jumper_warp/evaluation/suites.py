@@ -22,6 +22,7 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
 from jumper_warp.utils.rotations import turn_plane
 from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
@@ -117,7 +118,8 @@ class Ring(Suite):
         landings = self.run_landings(run, goals, film="jumps")
         plot(run, "landings", f"Jumps over {self.radius:g} m", {"": landings}, f"{self.num_jumps} jumps")
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
-        rows, values = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate"), jump_metrics(landings.outcome)
+        rows = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate")
+        values = jump_metrics(landings.outcome)
         for i, name in enumerate(SECTORS):
             values |= measure(rows, landings.outcome, sector == i, f"{name}_", name)
         return values
@@ -152,13 +154,19 @@ class Consecutive(Suite):
         rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
-        logs, paths = [], []
+        logs = []
+        paths = []
         for name, goals in (("pairs", pairs), ("row", rows)):
             positions: list[np.ndarray] = []
-            logs.append(self.run_landings(
-                run, goals, delay=rng.uniform(*DELAYS, len(goals)), film=name,
-                on_step=lambda log, to=positions: to.append(running_positions(log)),
-            ))  # fmt: skip
+            logs.append(
+                self.run_landings(
+                    run,
+                    goals,
+                    delay=rng.uniform(*DELAYS, len(goals)),
+                    film=name,
+                    on_step=lambda log, to=positions: to.append(running_positions(log)),
+                )
+            )
             paths.append(turn_plane(np.stack(positions, axis=1), -logs[-1].headings[:, None]))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
@@ -185,7 +193,8 @@ def consecutive_metrics(pairs: JumpLog, row: JumpLog) -> Metrics:
     """
     first, rows = pairs.outcome, row.outcome
     errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
-    halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
+    halves = np.arange(2).repeat(len(first.landed) // 2)[:, None]
+    numbers = np.arange(2)
     return {
         **jump_metrics(first),
         **{key: value for i, name in enumerate(PAIRS)
@@ -220,10 +229,11 @@ class Platform(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = 0.3, GROUND_LOWER[0]
+        low = 0.3
+        high = GROUND_LOWER[0]
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
-    def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
+    def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, Json, np.ndarray]]:
         """Yield the test grounds: name, arguments for `Env`, headings [rad] (num_envs,); goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
@@ -250,7 +260,8 @@ class Platform(Suite):
         """Run the jumps of all scenes, plot them, and return the metrics as `<scene>_<key>`."""
         rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
-        run.settings["edge_m"], values = self.edge, {}
+        run.settings["edge_m"] = self.edge
+        values = {}
         done: dict[str, JumpLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
             env = run.env(self.num_jumps, **scene)
@@ -259,7 +270,8 @@ class Platform(Suite):
             if "block" in scene:
                 slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
                 values |= {"block_slide_mean_m": mean(slide, "jumps"), "block_slide_max_m": largest(slide, "jumps")}
-        words, outlines = f"{self.num_jumps} jumps each", self.outlines(goals)
+        words = f"{self.num_jumps} jumps each"
+        outlines = self.outlines(goals)
         plot(run, "landings", "Jumps to other grounds", done, words, outlines=outlines)
         return values
 
@@ -287,7 +299,9 @@ class Farthest(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        near, far, limits = self.min_distance, self.max_distance, f"0.1 <= min_distance <= max_distance <= {LIMIT:g} m"
+        near = self.min_distance
+        far = self.max_distance
+        limits = f"0.1 <= min_distance <= max_distance <= {LIMIT:g} m"
         check(0.1 <= near <= far <= LIMIT, f"need {limits}, got {near} and {far}")
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
@@ -299,7 +313,8 @@ class Farthest(Suite):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run jumps to ever farther goals until success is below GIVEN_UP, plot them, and return the metrics."""
-        env, bins = run.env(self.num_jumps), {}
+        env = run.env(self.num_jumps)
+        bins = {}
         for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
             middle = round(self.min_distance + number * BIN, 6)
             bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")
@@ -316,8 +331,15 @@ class Farthest(Suite):
         }
         errors = np.array([np.where(o.success, o.distance_at_rest_m, np.nan)[:, 0] for o in outcomes])
         conditions = f"{run.title}, {self.num_jumps} jumps each"
-        plot_distances(run.folder / "max_jump.png", [*bins], successes, errors, reliable=RELIABLE, published=PUBLISHED,
-                       conditions=conditions)  # fmt: skip
+        plot_distances(
+            run.folder / "max_jump.png",
+            [*bins],
+            successes,
+            errors,
+            reliable=RELIABLE,
+            published=PUBLISHED,
+            conditions=conditions,
+        )
         return distance_metrics(bins)
 
 
@@ -341,8 +363,12 @@ def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     bins: logs by distance at the bin's middle [m], ascending.
     """
     outcomes = [landings.outcome for landings in bins.values()]
-    together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
-                              for name in (field.name for field in fields(JumpOutcome))})  # fmt: skip
+    together = JumpOutcome(
+        **{
+            name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
+            for name in (field.name for field in fields(JumpOutcome))
+        }
+    )
     goals = np.concatenate([landings.goals for landings in bins.values()])
     inside = within(goals[..., 0], IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]

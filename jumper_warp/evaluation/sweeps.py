@@ -18,6 +18,7 @@ from jumper_warp.evaluation.run import HEADLINES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation, with_jump_terminations
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
 
@@ -52,7 +53,7 @@ class Suite(EvaluationArgs, ABC):
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, write plots into `run.folder`, and return the metrics by key."""
 
-    def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
+    def run(self, modules: Iterable[ModuleType] = ()) -> Json:
         """Run the suite on its policy, write and print the metrics, and return them; modules: the user's task modules.
 
         Raises PolicyError, CheckpointError or InputError, see `EvaluationRun.from_args`.
@@ -67,9 +68,15 @@ class Suite(EvaluationArgs, ABC):
         return run, self.measure(run)
 
     def run_landings(
-        self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
-        delay: np.ndarray | float = DELAY, **options: Any,
-    ) -> JumpLog:  # fmt: skip
+        self,
+        run: EvaluationRun,
+        goals: np.ndarray,
+        env: Env | None = None,
+        *,
+        headings: np.ndarray | None = None,
+        delay: np.ndarray | float = DELAY,
+        **options: Any,
+    ) -> JumpLog:
         """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
         env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `JumpLog`; options:
@@ -153,11 +160,18 @@ class HeightSweep(Sweep):
         jumps = self.run_sweep(run, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         plot_sweep(
-            run.folder / "sweep.png", jumps.goals[:, 0, 2], jumps.apex[:, 0], jumps.outcome.reached[:, 0], limit=limit,
-            tolerance=TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
+            run.folder / "sweep.png",
+            jumps.goals[:, 0, 2],
+            jumps.apex[:, 0],
+            jumps.outcome.reached[:, 0],
+            limit=limit,
+            tolerance=TOLERANCE,
+            paper=PAPER_HEIGHTS,
+            marks=("reached", "missed"),
+            title="Jumps to heights",
             labels=("commanded base height [m]", "highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
-        )  # fmt: skip
+        )
         inside = within(jumps.goals[..., 2], self.flags.success_range)
         values = limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
         return self.flags.metrics(jumps) | values | self.pushed_in_flight(run, with_jump_terminations)
@@ -201,7 +215,8 @@ class DistanceSweep(Sweep):
 
     def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of `jumper evaluate`, and the success rate over the distances of the paper's training."""
-        inside, success = within(log.goals[..., 0], PAPER_TRAINED), chosen(PLACE_METRICS, "success_rate")
+        inside = within(log.goals[..., 0], PAPER_TRAINED)
+        success = chosen(PLACE_METRICS, "success_rate")
         note = "over 0.4 to 1 m"
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 
@@ -212,10 +227,16 @@ class DistanceSweep(Sweep):
         landings = self.run_sweep(run, run.env(self.num_jumps, change), "jumps")
         trained = trained_range(run.task)["trained_range_m"]
         plot_sweep(
-            run.folder / "sweep.png", landings.goals[:, 0, 0], landings.landing[:, 0, 0],
-            landings.success[:, 0], tolerance=TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
+            run.folder / "sweep.png",
+            landings.goals[:, 0, 0],
+            landings.landing[:, 0, 0],
+            landings.success[:, 0],
+            tolerance=TOLERANCE,
+            paper=PAPER_DISTANCES,
+            marks=("on goal", "failed"),
             trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
-            labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
+            labels=("commanded distance [m]", "distance of the base at the end [m]"),
+            title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
-        )  # fmt: skip
+        )
         return self.metrics(landings) | self.pushed_in_flight(run, change)

@@ -69,7 +69,8 @@ def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
     commands: (..., 3), x, y, z [m] or velocities [m/s], [m/s], [rad/s]; the line names the farthest value of each
     component. None: no line.
     """
-    words, rows = [], np.zeros((0, 3)) if commands is None else np.reshape(commands, (-1, commands.shape[-1]))
+    words = []
+    rows = np.zeros((0, 3)) if commands is None else np.reshape(commands, (-1, commands.shape[-1]))
     for index, name, unit, low, high in trained_bounds(task) if len(rows) else ():
         values = rows[:, index]
         excess = np.maximum(low - values, values - high)
@@ -91,7 +92,8 @@ def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
     inside = np.all([within(goals[:, bound.index], (bound.low, bound.high)) for bound in bounds], axis=0)
     if inside.all() or not inside.any():
         return {}
-    success, ranges = log.success[:, 0], " × ".join(f"{bound.low:g} to {bound.high:g}" for bound in bounds)
+    success = log.success[:, 0]
+    ranges = " × ".join(f"{bound.low:g} to {bound.high:g}" for bound in bounds)
     return {
         "within_training_success_rate": rate(success[inside], f"jumps with goals of trained {ranges} m"),
         "beyond_training_success_rate": rate(success[~inside], "jumps beyond training"),
@@ -112,11 +114,13 @@ def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:
     for key, (value, *_) in start.items():
         name, _, index = key.removeprefix("start_").rpartition("_")
         if name in drawn[0] and index.isdigit():
-            values, label = np.array([arrays[name][0, int(index)] for arrays in drawn]), f"{name}[{index}]"
+            values = np.array([arrays[name][0, int(index)] for arrays in drawn])
+            label = f"{name}[{index}]"
         else:
             label = key.removeprefix("start_")
             values = np.array([arrays[label][0] for arrays in drawn])
-        low, high = values.min(), values.max()
+        low = values.min()
+        high = values.max()
         if max(low - value, value - high) > MARGIN * (high - low) > 0.0:
             words.append(f"{label} {value:g} (resets sampled {low:.3g} to {high:.3g})")
     if words:

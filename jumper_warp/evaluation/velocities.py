@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
@@ -14,6 +14,7 @@ from jumper_warp.evaluation.jumps import wrapped
 from jumper_warp.evaluation.log import EvaluationLog, check, listed
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate, yaw_of
 
@@ -49,12 +50,15 @@ class VelocityLog(EvaluationLog):
 
     def __post_init__(self) -> None:
         self.count = len(self.commands)
-        self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
+        self.end = np.full(self.count, -1)
+        self.fall_step = np.zeros(self.count, dtype=int)
         self.times = real_array(self.times, "times", float)
         self.step_dt = 0.0  # [s] Policy step; `begin` sets it
         self._slew = np.broadcast_to(real_array(self.slew, "slew", float), self.count)
         # (robots,) horizontal distance from the start [m], and yaw relative to the heading [rad]; until the fall
-        self.distance, self.yaw, self._start = np.zeros(self.count), np.zeros(self.count), np.zeros((self.count, 3))
+        self.distance = np.zeros(self.count)
+        self.yaw = np.zeros(self.count)
+        self._start = np.zeros((self.count, 3))
         self._command = np.zeros((self.count, 3))  # commands of the next policy step
         falls = [not term.options["time_out"] for term in self.task.terminations]
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
@@ -86,7 +90,8 @@ class VelocityLog(EvaluationLog):
         Keys: base_pos, base_quat (xyzw), base_vel, base_ang_vel (world axes), termination.
         """
         sim = env.sim
-        q, qd = sim.joint_q(), sim.joint_qd()
+        q = sim.joint_q()
+        qd = sim.joint_qd()
         arrays = {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(),
                   "base_ang_vel": qd[:, 3:6].copy(), "termination": env.task_arrays()["termination"]}  # fmt: skip
         step = len(self.velocity) + 1
@@ -148,7 +153,8 @@ class VelocityLog(EvaluationLog):
     @property
     def trials(self) -> dict[str, np.ndarray]:
         """Sets of robots from which metrics are computed: a mask (robots,) by the set's name, such as "robots"."""
-        stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
+        stands = ~self.commands.any(axis=(1, 2))
+        slewed = np.isfinite(self._slew)
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
                 "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
@@ -171,7 +177,7 @@ class VelocityLog(EvaluationLog):
         """Return values to plot: the current velocities and commands of all robots."""
         return velocity_series(self.velocity[-1], self.command_history()[-1])
 
-    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+    def notes(self, worlds: Sequence[int]) -> Json:
         """Return metadata of a recording: commands of some robots and their times, keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
@@ -262,7 +268,8 @@ class VelocityFlags:
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
         """Return a new log of walks, one robot per world; seed: for the order of the commands after the first."""
-        rng, grid = np.random.default_rng(seed), command_grid(self.commands_per_axis, self.max_velocity)
+        rng = np.random.default_rng(seed)
+        grid = command_grid(self.commands_per_axis, self.max_velocity)
         times = np.arange(0.0, self.seconds - 1.0e-9, self.command_interval)
         commands = np.concatenate([grid, *(rng.permutation(grid) for _ in times[1:])], axis=1)
         slew = np.repeat([np.inf, SLEW_RATE, np.inf], [len(grid), len(grid), STANDING])

@@ -167,7 +167,8 @@ def characterise_motor(
     check_within("torque noise", np.array([torque_noise]), (1.0e-6, 100.0))
     if np.ptp(bench.command) == 0.0:
         raise InputError("bench: the command must change to determine the motor's constants")
-    nominal, names = described_constants(kind), list(PRIORS)
+    nominal = described_constants(kind)
+    names = list(PRIORS)
     prior_std = np.array([PRIORS[name][0] for name in names])
 
     def constants(z: np.ndarray) -> dict[str, float]:  # z: (9,) logarithms in standard deviations of their priors

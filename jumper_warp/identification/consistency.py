@@ -107,7 +107,8 @@ def parameter_tests(
     deviations by correlated residuals.
     """
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
-    tests, level = [], test_level(problem)
+    tests = []
+    level = test_level(problem)
     for sensor in sensors(problem, normal):
         information = sensor.information
         variance, vectors = np.linalg.eigh(information - information @ covariance @ information)
@@ -115,7 +116,8 @@ def parameter_tests(
         if rank := int(known.sum()):
             squares = (vectors.T @ sensor.score)[known] ** 2 / variance[known]
             limit = chi2_limit(rank, 0.0, 1.0, level)
-            chi2, name = float(np.mean(squares)) / mismatch**2, f"parameters by {sensor.name}"
+            chi2 = float(np.mean(squares)) / mismatch**2
+            name = f"parameters by {sensor.name}"
             tests.append((sensor, FitTest(sensor.motion.motion.name, name, chi2, limit, mismatch**2)))
     return tests
 
@@ -152,12 +154,15 @@ def residual_tests(problem: LeastSquares, normal: NormalEquations) -> list[FitTe
         tables[:, motion.valid] = linear.residual, leverage
         rows = []  # by channel: sum of squares, number of values, number of fitted values, variance factor
         for name, columns in motion.channels:
-            values, valid = tables[:, :, columns], motion.valid[:, columns]
+            values = tables[:, :, columns]
+            valid = motion.valid[:, columns]
             if not valid.any():
                 continue
             series = [values[0, valid[:, i], i] for i in range(valid.shape[1])]
-            squares, fitted = float(np.nansum(values[0] ** 2)), float(np.nansum(values[1]))
-            count, factor = int(valid.sum()), variance_factor(series)
+            squares = float(np.nansum(values[0] ** 2))
+            fitted = float(np.nansum(values[1]))
+            count = int(valid.sum())
+            factor = variance_factor(series)
             rows.append((squares, count, fitted, factor * count))
             limit = chi2_limit(count, fitted, factor, level)
             tests.append(FitTest(motion.motion.name, name, squares / count, limit, factor))

@@ -34,7 +34,8 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
     filter's.
     """
     limits = walking_filter() if limits is None else limits
-    angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
+    angle = record.angle[..., 0] / DEGREES
+    rate = np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)
     checks = (
         ("lateral angle", legs[..., 0], limits.lateral),
@@ -65,7 +66,8 @@ class Scorer:
 
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
         """Prepare to rate motions by what they reveal about `parameters` under sensor `noise`; replay: simulation."""
-        self.parameters, self.noise = parameters, noise or NoiseLevels()
+        self.parameters = parameters
+        self.noise = noise or NoiseLevels()
         self.replay = replay or MotionReplay()
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
@@ -117,8 +119,12 @@ def choose(
     A candidate's score is the information of all motions chosen earlier and of itself. candidates: number tried by
     motion; seconds [s]: duration of a motion. Raises InputError: no candidate of a kind is safe.
     """
-    rng, size = np.random.default_rng(seed), len(scorer.parameters)
-    information, plans, gains, refused = np.eye(size), [], [], []
+    rng = np.random.default_rng(seed)
+    size = len(scorer.parameters)
+    information = np.eye(size)
+    plans = []
+    gains = []
+    refused = []
     with phase("planning motions", len(kinds) * candidates) as advance:
         for kind in kinds:
             best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
@@ -158,7 +164,8 @@ def record_motions(
     motions = []
     with phase("recording motions", len(chosen.plans)) as advance:
         for i, plan in enumerate(chosen.plans):
-            name, record = f"{i}_{plan.kind.replace(' ', '_')}", simulate_plan(plan, solver=solver, robots=robots)
+            name = f"{i}_{plan.kind.replace(' ', '_')}"
+            record = simulate_plan(plan, solver=solver, robots=robots)
             motions.append(measure(plan, name, record, robots, rng, noise, torque=torque))
             motions[-1].save(folder / f"{name}.npz")
             advance()

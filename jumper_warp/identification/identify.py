@@ -83,7 +83,8 @@ def identify(
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
         replay = MotionReplay(description=description, device=device, threads=threads)
-    robot, coarse_dt = replay.description, None if dt is None else max(dt, COARSE_DT)
+    robot = replay.description
+    coarse_dt = None if dt is None else max(dt, COARSE_DT)
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
     coarse = whole if coarse_dt == dt else [MotionResiduals(m, parameters, noise, robot, coarse_dt) for m in motions]
     pieces = []
@@ -125,7 +126,8 @@ def identify_by_evolution(
     replay = MotionReplay(device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
     problem = LeastSquares(parameters, whole, replay, prior_measurements)
-    point, descent = problem.nominal_point(), Descent(replay)
+    point = problem.nominal_point()
+    descent = Descent(replay)
     low, high = parameters.bounds()
     options = {"popsize": population, "seed": seed + 1, "verbose": -9, "bounds": [low, high]}
     search = cma.CMAEvolutionStrategy(point.z, FIRST_STD, options)
@@ -137,7 +139,8 @@ def identify_by_evolution(
             costs = problem.costs(candidates, starts)
             search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
             if costs.min() < cost:
-                best, cost = candidates[int(np.argmin(costs))], float(costs.min())
+                best = candidates[int(np.argmin(costs))]
+                cost = float(costs.min())
             effort = descent.effort()
             descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
             advance(effort.seconds - seconds)
@@ -153,7 +156,10 @@ class Descent:
 
         replay: simulation whose physics steps are counted; advance: called after every stage.
         """
-        self.replay, self.steps, self.stage, self.advance = replay, [], 0, advance
+        self.replay = replay
+        self.steps = []
+        self.stage = 0
+        self.advance = advance
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:
@@ -163,7 +169,8 @@ class Descent:
 
     def record_step(self, problem: LeastSquares, trial: Trial) -> None:
         """Append the result of a Levenberg-Marquardt step to the log `steps`."""
-        chi2, effort = trial.cost / problem.count, self.effort()
+        chi2 = trial.cost / problem.count
+        effort = self.effort()
         self.steps.append(DescentStep(self.stage, chi2, trial.damping, effort.world_steps, effort.seconds))
 
     def minimise(
@@ -175,15 +182,18 @@ class Descent:
         that lowers the cost by less than this fraction; None: at the first step with a new Jacobian that lowers it by
         less than `CONVERGED`. While steps are `GOOD_STEP`, Broyden's update replaces a new Jacobian.
         """
-        new_jacobian, self.stage = decrease is not None, self.stage + 1
+        new_jacobian = decrease is not None
+        self.stage = self.stage + 1
         for _ in range(MAX_STEPS):
             least = max((decrease or 0.0) * normal.cost, CONVERGED * problem.scale(normal))
             trial = problem.step(point, normal, geodesic=new_jacobian)
             self.record_step(problem, trial)
-            gain, predicted = normal.cost - trial.cost, trial.predicted_decrease
+            gain = normal.cost - trial.cost
+            predicted = trial.predicted_decrease
             if gain < least and (new_jacobian or (decrease is not None and predicted < least)):
                 residuals = replace_residuals(normal.linearised, trial.residuals)
-                point, normal = trial.point, problem.assemble(trial.point, residuals)
+                point = trial.point
+                normal = problem.assemble(trial.point, residuals)
                 break
             new_jacobian = gain < max(least, GOOD_STEP * predicted)
             normal = problem.normal(trial.point) if new_jacobian else problem.broyden_update(normal, point, trial)
@@ -227,13 +237,17 @@ def descend(
     coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
     of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
     """
-    replay, z = descent.replay, np.zeros(len(parameters))
+    replay = descent.replay
+    z = np.zeros(len(parameters))
     if pieces:
         problem = LeastSquares(parameters, pieces, replay, prior_measurements, robust=True)
         begin = problem.nominal_point()
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
     final = LeastSquares(parameters, whole, replay, prior_measurements)
-    minima, rng, left_out, initial = [], np.random.default_rng(0), set(), []
+    minima = []
+    rng = np.random.default_rng(0)
+    left_out = set()
+    initial = []
     direct = found_direct = False  # whether a start, and that of the best minimum, begins with all motions
     while len(minima) < MAX_STARTS:
         if minima:
@@ -290,7 +304,9 @@ def add_motions(
     Motions with a held base come first, as their legs do not interact; then always the motion with the least misfit.
     The robust cost limits outliers, such as a paw that strikes 1 ms late.
     """
-    point, added, linearised = Point(z, []), [], []
+    point = Point(z, [])
+    added = []
+    linearised = []
     while len(added) < len(motions):
         remaining = [i for i in range(len(motions)) if i not in added]
         held = [i for i in remaining if not motions[i].free]

@@ -49,19 +49,24 @@ class InitialStatePrior:
 
     def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
         """Estimate the initial state and its standard deviations from a motion's first rows and the robot's stance."""
-        self.free, self.description = motion.base == "free", description
+        self.free = motion.base == "free"
+        self.description = description
         self.size = 36 if self.free else 27  # Number I of coordinates
         rows = min(FIRST_ROWS, len(motion.time))
-        angle_noise, rate_noise = DEGREES * noise.angle, DEGREES * noise.rate
+        angle_noise = DEGREES * noise.angle
+        rate_noise = DEGREES * noise.rate
         angle, angle_std = first_values(motion.angle, motion.target[0], TRUST * angle_noise, 10.0 * DEGREES)
         rate, rate_std = first_values(motion.rate, np.zeros(12), TRUST * rate_noise, 1.0)
         if motion.rate is None and motion.angle is not None:
-            rate, rate_std = column_slopes(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
-        level, position = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
+            rate = column_slopes(motion.time[:rows], motion.angle[:rows])
+            rate_std = np.full(12, 1.0)
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        position = np.array([0.0, 0.0, HANGING_HEIGHT])
         quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
         quaternion = quaternion / np.linalg.norm(quaternion)
         tilt_std = np.full(3, math.radians(2.0 if motion.quaternion is not None else 5.0))
-        velocity, base_std = np.zeros(3), []
+        velocity = np.zeros(3)
+        base_std = []
         self.standing = self.resting = False
         if self.free:
             ground = stance(description, angle[None], rate[None])
@@ -89,7 +94,8 @@ class InitialStatePrior:
         True angles are readings minus offsets. A standing robot's base is placed so that all paws are on the ground;
         its base coordinates are added afterwards.
         """
-        mean, deviation = self._mean, z * self._std
+        mean = self._mean
+        deviation = z * self._std
         state = InitialStates(*(np.repeat(getattr(mean, name), len(z), axis=0) for name in vars(mean)))
         state.angle = state.angle + deviation[:, :12] - robots.offset
         state.rate = state.rate + deviation[:, 12:24]
@@ -169,16 +175,22 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
     paws = np.zeros((len(angle), 4, 3))
     for k, name in enumerate(LEGS):
         leg = leg_dimensions(description, name)
-        lateral, outer, inner = angle[:, 3 * k], angle[:, 3 * k + 1], angle[:, 3 * k + 2]
-        outer_x, outer_z = leg.outer_x + leg.front * leg.thigh * np.sin(outer), -leg.thigh * np.cos(outer)
-        inner_x, inner_z = leg.inner_x - leg.front * leg.thigh * np.sin(inner), -leg.thigh * np.cos(inner)
-        across, up = outer_x - inner_x, outer_z - inner_z
+        lateral = angle[:, 3 * k]
+        outer = angle[:, 3 * k + 1]
+        inner = angle[:, 3 * k + 2]
+        outer_x = leg.outer_x + leg.front * leg.thigh * np.sin(outer)
+        outer_z = -leg.thigh * np.cos(outer)
+        inner_x = leg.inner_x - leg.front * leg.thigh * np.sin(inner)
+        inner_z = -leg.thigh * np.cos(inner)
+        across = outer_x - inner_x
+        up = outer_z - inner_z
         distance = np.maximum(np.hypot(across, up), 1.0e-6)
         rise = np.sqrt(np.maximum(leg.shank**2 - 0.25 * distance**2, 1.0e-9)) / distance
         x = 0.5 * (outer_x + inner_x) + leg.front * rise * up
         z = 0.5 * (outer_z + inner_z) - leg.front * rise * across
         y = leg.plane_y + leg.knee_y
-        sine, cosine = leg.side * np.sin(lateral), np.cos(lateral)
+        sine = leg.side * np.sin(lateral)
+        cosine = np.cos(lateral)
         paws[:, k] = np.array(leg.hip) + np.stack([x, cosine * y - sine * z, sine * y + cosine * z], axis=1)
     return paws
 
@@ -202,8 +214,10 @@ def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -
         cross[..., 3 + i] = np.cross(np.eye(3)[i], points)
     # the velocity off the ground counts most
     frame = np.eye(3) + NORMAL_WEIGHT * up[:, :, None] * up[:, None]
-    cross, paw_velocity = frame[:, None] @ cross, np.einsum("nij,nkj->nki", frame, paw_velocity)
-    rows, target = cross.reshape(len(paws), 12, 6), -paw_velocity.reshape(len(paws), 12, 1)
+    cross = frame[:, None] @ cross
+    paw_velocity = np.einsum("nij,nkj->nki", frame, paw_velocity)
+    rows = cross.reshape(len(paws), 12, 6)
+    target = -paw_velocity.reshape(len(paws), 12, 1)
     twist = np.linalg.solve(np.swapaxes(rows, 1, 2) @ rows, np.swapaxes(rows, 1, 2) @ target)[..., 0]
     return Stance(radius - plane[:, 2] / size, up, np.abs(distance).max(axis=1), twist[:, :3], twist[:, 3:])
 

@@ -65,7 +65,8 @@ class NormalEquations:
         About the normalised parameters, while the motion's initial state follows them. The score is the gradient of
         half the residuals' cost. index: of the motion.
         """
-        linear, weight = self.linearised[index], self.weights[index][rows]
+        linear = self.linearised[index]
+        weight = self.weights[index][rows]
         jacobian = linear.jacobian[rows]
         follow = -np.linalg.solve(self.start_matrices[index], self.cross_matrices[index].T)
         along = np.vstack([np.eye(len(self.gradient)), follow])
@@ -154,7 +155,9 @@ class LeastSquares:
         robust: bool = False,
     ):
         """Collect the unknowns of the problem; robust: Cauchy loss, in which outliers (late contacts) count less."""
-        self.parameters, self.motions, self.replay = parameters, motions, replay
+        self.parameters = parameters
+        self.motions = motions
+        self.replay = replay
         self.prior_measurements, self.robust = prior_measurements, robust
         self._typical = math.inf
         self.count = sum(int(motion.valid.sum()) for motion in motions)  # Number of measured values
@@ -256,7 +259,8 @@ class LeastSquares:
 
         At `trial`, from the Jacobians of `normal` at `old`. The update's norm weighs the unknowns by their curvature.
         """
-        linearised, new = [], trial.point
+        linearised = []
+        new = trial.point
         parts = zip(normal.linearised, trial.residuals, old.starts, new.starts, normal.start_matrices, strict=True)
         for linear, residual, old_start, new_start, start_matrix in parts:
             move = np.concatenate([new.z - old.z, new_start - old_start])
@@ -299,7 +303,8 @@ class LeastSquares:
     def _costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Return the costs (K,) of K candidate points and the residuals of each motion there, (m, K) by motion."""
         cost = np.sum(z**2, axis=1) + sum(np.sum(start**2, axis=1) for start in starts)
-        robots, residuals = self.parameters.robots(z, self.replay.description), []
+        robots = self.parameters.robots(z, self.replay.description)
+        residuals = []
         for prior in self.prior_measurements:
             cost += ((prior.measure(robots) - prior.value) / prior.std) ** 2
         for motion, start in zip(self.motions, starts, strict=True):
@@ -354,7 +359,8 @@ class LeastSquares:
         """
         size = len(point.z)
         ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)
-        gradient, start_gradients = np.zeros((size, len(plain))), []
+        gradient = np.zeros((size, len(plain)))
+        start_gradients = []
         for i, (motion, linear, weight) in enumerate(zip(self.motions, normal.linearised, normal.weights, strict=True)):
             move = np.array([start[i] for _, start in plain])
             residual = motion.residuals(self.replay, ahead, point.starts[i] + PROBE * move)
@@ -371,6 +377,7 @@ class LeastSquares:
             if np.isfinite(gradient[:, k]).all() and all(np.isfinite(slope).all() for slope in slopes):
                 more, more_starts = normal.solve(DAMPINGS[k], free, gradient[:, k], slopes)
                 if np.linalg.norm(more) < np.linalg.norm(move):
-                    move, starts = move + more, [a + b for a, b in zip(starts, more_starts, strict=True)]
+                    move = move + more
+                    starts = [a + b for a, b in zip(starts, more_starts, strict=True)]
             accelerated.append((move, starts))
         return accelerated

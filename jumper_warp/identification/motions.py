@@ -94,7 +94,8 @@ class RecordedMotion:
 
     def __post_init__(self) -> None:
         """Raise InputError for a measured channel of wrong shape, not finite or out of range, or an invalid setting."""
-        n, where = len(self.time), f"motion {self.name}"
+        n = len(self.time)
+        where = f"motion {self.name}"
         if not 3 <= n <= MAX_ROWS or self.time.ndim != 1:
             raise InputError(f"{where}: time must be one column of 3 to {MAX_ROWS} rows, got shape {self.time.shape}")
         if not np.isfinite(self.time).all() or not (np.diff(self.time) > 0.0).all():
@@ -155,7 +156,8 @@ def check_distinct(motions: Sequence[RecordedMotion]) -> None:
     if not motions:
         raise InputError("there must be at least one motion")
     for (i, one), (j, other) in itertools.combinations(enumerate(motions, 1), 2):
-        both, columns = one.columns(), other.columns()
+        both = one.columns()
+        columns = other.columns()
         names = [name for name in both if name in columns and name != "time"]
         if len(names) > 1 and all(_agree(both[name], columns[name]) for name in names):
             raise InputError(f"motions {i} ({one.name}) and {j} ({other.name}) are the same recording: give it once")
@@ -255,7 +257,8 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     rows = csv_rows(path)
     if len(rows) < 2:
         raise InputError(f"{path}: expected a line of names and rows of numbers")
-    names, columns = [name.strip() for name in rows[0]], []
+    names = [name.strip() for name in rows[0]]
+    columns = []
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(names):
             raise InputError(f"{path} line {number}: expected {len(names)} values, found {len(row)}")

@@ -117,7 +117,8 @@ class ParameterSet:
     def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
         """Return N robots with the parameter values of normalised coordinates z (N, P), otherwise as described."""
         z = np.atleast_2d(z)
-        robots, values = RobotValues.nominal(len(z), description), self.values(z)
+        robots = RobotValues.nominal(len(z), description)
+        values = self.values(z)
         for i, parameter in enumerate(self.parameters):
             getattr(robots, parameter.quantity)[:, parameter.places] = values[:, i, None]
         return robots
@@ -127,7 +128,8 @@ class ParameterSet:
 
         Raises InputError: a name that is none of these.
         """
-        left_out, known = set(names), {*GROUPS, *self.names, *(p.quantity for p in self.parameters)}
+        left_out = set(names)
+        known = {*GROUPS, *self.names, *(p.quantity for p in self.parameters)}
         if left_out - known:
             raise InputError(
                 f"unknown parameter {min(left_out - known)!r:.60} to exclude; expected one of {', '.join(self.names)}"
@@ -189,7 +191,8 @@ def relative(
     and armature: combinations that the motions do not determine lie along straight lines of z, which steps of the
     optimiser follow.
     """
-    low, high = nominal * max(1.0 - 5.0 * prior, 0.1), nominal * (1.0 + 5.0 * prior)
+    low = nominal * max(1.0 - 5.0 * prior, 0.1)
+    high = nominal * (1.0 + 5.0 * prior)
     return Parameter(name, quantity, tuple(places), unit, nominal, prior * nominal, (low, high), "absolute", group)
 
 

@@ -71,7 +71,8 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
     hung: whether the robot hangs on a stand; otherwise the motion is smaller and slower.
     """
     time = TICK * np.arange(ticks)
-    slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
+    slow = rng.uniform(0.3, 0.8)
+    fast = rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
     cycles = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
     middle = rng.uniform(40.0, 55.0) if hung else rng.uniform(45.0, 60.0)
     target = np.zeros((ticks, 12))
@@ -89,8 +90,13 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
 
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
     """Sample motor targets [deg] (ticks, 12) of a squat, push-off and landing, with random offsets of each motor."""
-    squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
-    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] durations of squatting, waiting, push-off
+    squat = rng.uniform(75.0, 95.0)
+    push = rng.uniform(5.0, 25.0)
+    land = rng.uniform(50.0, 65.0)
+    # [ticks] durations of squatting, waiting, push-off
+    down = 22
+    hold = rng.integers(6, 12)
+    up = rng.integers(9, 13)
     target = np.zeros((ticks, 12))
     for tick in range(ticks):
         if tick < down + hold:
@@ -104,8 +110,10 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
     """Return the initial state of a planned motion: at rest in the first targets' pose; if free, 1 mm above ground."""
-    angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
-    height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
+    angle = plan.target[:1] - robots.offset
+    rest = np.zeros((1, 12))
+    height = HANGING_HEIGHT
+    quaternion = np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":
         height = stance(replay.description, angle, rest).height[0] + 1.0e-3
     zero = np.zeros((1, 3))
@@ -116,8 +124,10 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
     """Simulate one robot under planned motor targets from rest by `replay`, and return its motion at 240 Hz.
 
     refine: physics steps per 1/480 s."""
-    period, stride = TICK / SAMPLES, 2 * refine
-    rest, rows = round(REST / period), plan.rows
+    period = TICK / SAMPLES
+    stride = 2 * refine
+    rest = round(REST / period)
+    rows = plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
     record = replay.run(
         robots, initial_state(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
@@ -141,14 +151,16 @@ def simulate_plan(
     robots = RobotValues.nominal(1) if robots is None else robots
     held = plan.base == "fixed"
     sim = _make_simulation(plan, solver, robots, dt, held)
-    rows, rest = plan.rows, round(REST / period)
+    rows = plan.rows
+    rest = round(REST / period)
     target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
     delay = float(robots.latency[0, 0]) / dt  # in physics steps
     delayed_target = wp.zeros((12, 1), dtype=float, device=sim.device)
     rows_read = []
     held_pose = sim.joint_q()[0, :7].copy()
     for row in range(len(target)):
-        q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
+        q = sim.joint_q()[0].copy()
+        qd = sim.joint_qd()[0].copy()
         for step in range(stride):
             now = row * stride + step
             whole = math.floor(delay)
@@ -170,7 +182,8 @@ def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: fl
     """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base."""
     values = RobotValues(**{name: value[:1].copy() for name, value in vars(robots).items()})
     if held:
-        values.base_mass[:], values.base_com[:] = HELD_MASS, 0.0
+        values.base_mass[:] = HELD_MASS
+        values.base_com[:] = 0.0
     motors = MotorCfg.from_description(load_description(), "jumping", plan.torque_limit, plan.torque_limit)
     sim = Simulation(1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, device="cpu", threads=1)
     angle = plan.target[0] - values.offset[0]
@@ -189,8 +202,10 @@ def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: fl
 
 def _reset_base(sim: Simulation, pose: np.ndarray) -> None:
     """Reset the base of world 0 to a pose (7,), position [m] and quaternion xyzw in the world frame, at rest."""
-    q, qd = sim.state.joint_q.numpy(), sim.state.joint_qd.numpy()
-    q[:7], qd[:6] = pose, 0.0
+    q = sim.state.joint_q.numpy()
+    qd = sim.state.joint_qd.numpy()
+    q[:7] = pose
+    qd[:6] = 0.0
     sim.state.joint_q.assign(q)
     sim.state.joint_qd.assign(qd)
 

@@ -45,7 +45,8 @@ class MotionReplay:
         """Store the robot, by default the project's, and the number of CPU threads for later simulations."""
         self.description = load_description() if description is None else description
         self.world_steps = 0  # Physics steps of all worlds so far
-        self._device, self._threads = device, checked_threads(threads)
+        self._device = device
+        self._threads = checked_threads(threads)
         self._rollouts: dict[tuple[int, float], tuple[Rollout, np.ndarray]] = {}
 
     def run(
@@ -70,7 +71,9 @@ class MotionReplay:
         the base at its initial pose. gains, torque_limit [N m]: of the described motors, which the ratios of `robots`
         scale.
         """
-        count, steps = len(starts.angle), (rows - 1) * stride + 1  # the last row's torques take one more step
+        # the last row's torques take one more step
+        count = len(starts.angle)
+        steps = (rows - 1) * stride + 1
         rollout, nominal = self._rollout(count, dt)
         motors = MotorCfg.from_description(self.description, gains, torque_limit, torque_limit)
         write_motors(rollout.parameters, motors, robots)
@@ -133,14 +136,18 @@ def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
     Rows as in `kernels.layout`; nominal: as described, (321, 1).
     """
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
-    mass, com = robots.base_mass[:, 0], robots.base_com.T
-    nominal_mass, nominal_moment = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]
+    mass = robots.base_mass[:, 0]
+    com = robots.base_com.T
+    nominal_mass = table[layout.BASE]
+    nominal_moment = table[layout.BASE + 1 : layout.BASE + 4]
     for row, (i, j) in enumerate(PAIRS, int(layout.BASE) + 4):
         central = table[row] - nominal_moment[i] * nominal_moment[j] / nominal_mass
         table[row] = central * robots.base_inertia[:, 0] * mass / nominal_mass + mass * com[i] * com[j]
-    table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4] = mass, mass * com
+    table[layout.BASE] = mass
+    table[layout.BASE + 1 : layout.BASE + 4] = mass * com
     for leg in range(4):
-        rows, motors = table[leg * int(layout.LEG_ROWS) : (leg + 1) * int(layout.LEG_ROWS)], slice(3 * leg, 3 * leg + 3)
+        rows = table[leg * int(layout.LEG_ROWS) : (leg + 1) * int(layout.LEG_ROWS)]
+        motors = slice(3 * leg, 3 * leg + 3)
         for link in range(len(LINK_KINDS)):
             rows[link * layout.MOMENT_ROWS : (link + 1) * layout.MOMENT_ROWS] *= robots.link_mass[:, link]
         rows[layout.ARMATURE : layout.ARMATURE + 3] = robots.armature[:, motors].T

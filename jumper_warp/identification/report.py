@@ -107,7 +107,10 @@ def randomization_ranges(result: Identification) -> dict[str, tuple[float, float
         rows[row] = (min(low, old_low), max(high, old_high))
 
     for parameter, value, (low, high) in zip(result.parameters, result.values, result.intervals, strict=True):
-        quantity, value, low, high = parameter.quantity, float(value), float(low), float(high)
+        quantity = parameter.quantity
+        value = float(value)
+        low = float(low)
+        high = float(high)
         if quantity in RATIO_ROWS:
             widen(RATIO_ROWS[quantity], low / value, high / value)
         elif quantity == "base_mass":

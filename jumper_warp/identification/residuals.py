@@ -67,9 +67,12 @@ class MotionResiduals:
         sign, gaps, or dt out of range; NothingMeasured.
         """
         check_signs(motion)
-        whole, (first, end) = motion, span or (0, len(motion.time))
+        whole = motion
+        (first, end) = span or (0, len(motion.time))
         motion = rows_of(whole, first, end)
-        self.motion, self.parameters, self.description = motion, parameters, description
+        self.motion = motion
+        self.parameters = parameters
+        self.description = description
         self.free = motion.base == "free"
         begin = self._make_grid(dt)
         self.lead = self.stride * min(math.ceil(LONGEST_LATENCY / (self.stride * self.dt)), 10**6 if first else 0)
@@ -89,18 +92,22 @@ class MotionResiduals:
         Sets stride, dt, rows and the row's position on the grid. Stamps that are uniform but for `JITTER` count as
         uniform. Raises InputError: a gap above `LONGEST_GAP`.
         """
-        motion, index = self.motion, np.arange(len(self.motion.time), dtype=float)
+        motion = self.motion
+        index = np.arange(len(self.motion.time), dtype=float)
         gaps = np.diff(motion.time)
         if gaps.max() > (1.0 + JITTER) * LONGEST_GAP:
             row = int(np.argmax(gaps)) + 1
             raise InputError(f"motion {motion.name}: gap of {gaps.max():.3g} s before row {row}: split it there")
-        time, begin = motion.time - motion.time[0], 0.0
+        time = motion.time - motion.time[0]
+        begin = 0.0
         period, middle = np.polyfit(index - index.mean(), time, 1)
         if np.abs(time - middle - period * (index - index.mean())).max() < JITTER * period:
-            (self.stride, self.dt), self._grid_row = grid_steps(period, dt), index
+            (self.stride, self.dt) = grid_steps(period, dt)
+            self._grid_row = index
             begin = middle - period * index.mean()
         else:
-            self.stride, self.dt = 1, grid_steps(1.0, dt)[1]
+            self.stride = 1
+            self.dt = grid_steps(1.0, dt)[1]
             self._grid_row = time / self.dt
         self.rows = int(math.ceil(self._grid_row[-1] - 1.0e-9)) + 1
         return float(motion.time[0] + begin)
@@ -110,9 +117,12 @@ class MotionResiduals:
 
         Sets `measured` and `valid` (n, columns), `sigma` (columns,) [SI] and `channels`, (name, columns) each.
         """
-        motion, columns = self.motion, []
+        motion = self.motion
+        columns = []
         self.channels: list[tuple[str, slice]] = []
-        sigma, legs, first = [], [], 0
+        sigma = []
+        legs = []
+        first = 0
         for name, (std, width) in channel_noise(noise).items():
             source = motion.quaternion if name == "orientation" else getattr(motion, name)
             if source is None or (not self.free and name == "position"):
@@ -126,7 +136,8 @@ class MotionResiduals:
             first += width
         self.measured = np.concatenate(columns, axis=1) if columns else np.zeros((len(motion.time), 0))
         self.valid = np.isfinite(self.measured)
-        self.sigma, self._leg = np.array(sigma), np.array(legs)
+        self.sigma = np.array(sigma)
+        self._leg = np.array(legs)
 
     def first_part(self, fraction: float) -> MotionResiduals:
         """Return the residuals of the first `fraction` (0 to 1) of the rows; the initial state's prior is unchanged."""
@@ -134,7 +145,8 @@ class MotionResiduals:
             return self
         part = copy.copy(self)
         end = max(3, round(fraction * len(self.motion.time)))
-        part.motion, part._grid_row = rows_of(self.motion, 0, end), self._grid_row[:end]
+        part.motion = rows_of(self.motion, 0, end)
+        part._grid_row = self._grid_row[:end]
         part.rows = int(math.ceil(part._grid_row[-1] - 1.0e-9)) + 1
         part.measured, part.valid = self.measured[:end], self.valid[:end]
         return part
@@ -220,7 +232,9 @@ class MotionResiduals:
         Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
         unknown of the four legs shares a world.
         """
-        size, single, shared = len(self.parameters), [], {}
+        size = len(self.parameters)
+        single = []
+        shared = {}
         fixed = FIXED_AT_REST if self.initial.resting else ()
         for i, parameter in enumerate(self.parameters):
             if self.free:
@@ -290,7 +304,8 @@ def mean_targets(motion: RecordedMotion, edges: np.ndarray) -> np.ndarray:
     """
     first = max(int(np.searchsorted(motion.time, edges[0], side="right")) - 1, 0)
     end = max(int(np.searchsorted(motion.time, edges[-1])), first + 1)
-    target, changes = motion.target[first:end], motion.time[first + 1 : end] - edges[0]
+    target = motion.target[first:end]
+    changes = motion.time[first + 1 : end] - edges[0]
     knots = np.concatenate([[0.0], changes, [edges[-1] - edges[0]]])
     area = np.concatenate([np.zeros((1, 12)), np.cumsum(np.diff(knots)[:, None] * target, axis=0)])
     at_edges = np.stack([np.interp(edges - edges[0], knots, column) for column in area.T], axis=1)

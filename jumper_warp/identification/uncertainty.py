@@ -105,14 +105,16 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
     columns: by motion, the measurement column (such as a motor's angle) of each residual, (m,). covariance: (P, P), of
     normalised parameters.
     """
-    size, information = len(covariance), np.linalg.inv(covariance)
+    size = len(covariance)
+    information = np.linalg.inv(covariance)
     channels: list[np.ndarray] = []
     motions: list[np.ndarray] = []
     parts = zip(normal.linearised, normal.weights, normal.start_matrices, normal.cross_matrices, columns, strict=True)
     for linear, weight, start_matrix, cross, column in parts:
         root = np.sqrt(weight)
         marginal = linear.jacobian[:, :size] - linear.jacobian[:, size:] @ np.linalg.solve(start_matrix, cross.T)
-        jacobian, residual = root[:, None] * marginal, root * linear.residual
+        jacobian = root[:, None] * marginal
+        residual = root * linear.residual
         for i in np.unique(column):
             channels.append(_leave_out_change(information, jacobian[column == i], residual[column == i]))
         motions.append(_leave_out_change(information, jacobian, residual))

@@ -1,30 +1,186 @@
-"""Look-up of policies by name or folder, and summaries of their metrics, without PyTorch."""
+"""Folders of policies, without PyTorch: look-up by name, verified files, atomic updates, summaries of metrics.
+
+A folder holds `policy.onnx` (weights, normaliser, interface), `config.json` (interface, environment, training, commit,
+versions), added files (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these. The
+manifest does not cover `README.md`. Checksums detect damage and mix-ups; they are not a signature.
+
+An update first adds the SHA-256 of the new files to the manifest as `updating`, then replaces the files, then writes
+the final manifest. So a reader accepts the old or the new content of each file in between, and a policy stays loadable
+if the update ends anywhere, such as on a full disk.
+"""
 
 from __future__ import annotations
 
-import os
+import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jumper_warp.policies.manifest import CONFIG, MANIFEST, ONNX, README, parse_object, read_files
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.assets import POLICIES, policy_tasks
+from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.errors import InputError, suggestion
-from jumper_warp.utils.files import read_file
+from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, write_atomically
 
+MANIFEST = "manifest.json"
+CONFIG = "config.json"
+ONNX = "policy.onnx"
+README = "README.md"
 METRICS = "metrics.json"
 PICTURE = "picture.webp"
+PICTURES = (".png", ".webp", ".jpg", ".gif")  # Suffixes of files that a policy does not need
+FORMAT = "jumper-warp policy"
+SCHEMA_VERSION = 3
+PURPOSE = "file of a policy"
+RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
 SUCCESSES = ("success_rate", "settled_without_collision_rate")
 """Keys of the success rate; a policy's is the first one that its metrics have."""
-ERRORS = (
-    "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "settled_rmse_vx_m_s", "error_at_end_mean_deg",
-)  # fmt: skip
+ERRORS = ("apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "settled_rmse_vx_m_s", "error_at_end_mean_deg")
 """Keys of the error; a policy's is the first one that its metrics have."""
+
+
+# ---------------------------------------------------------------------- look-up
+
+
+def find_policy(name: str | Path) -> Path:
+    """Return the folder of a policy: the project's policy called `name` (- counts as _), else `name` as a path.
+
+    Raises PolicyError: there is no such policy or folder, or it is that of a training without a checkpoint.
+    """
+    path = Path(name)
+    if own := _own_policy(path):
+        return own
+    if not path.is_dir():
+        raise PolicyError(_no_policy(str(name), path))
+    runs = [file.parent for pattern in (METRICS_FILE, f"*/{METRICS_FILE}") for file in path.glob(pattern)]
+    if runs and not any(map(is_run, runs)):
+        raise PolicyError(f"{path}: no checkpoint yet; a training saves them at its end and each --save-interval")
+    return path
+
+
+def _own_policy(name: Path) -> Path | None:
+    """Return the folder of the project's policy of this name (- counts as _), None: there is none."""
+    folder = POLICIES / str(name).replace("-", "_")
+    return folder if len(name.parts) == 1 and (folder / MANIFEST).is_file() else None
+
+
+def is_run(source: str | Path) -> bool:
+    """Return whether `source` is a checkpoint, or a training run's folder with checkpoints, also of rsl-rl."""
+    path = Path(source)
+    return path.suffix == ".pt" or any(path.glob("checkpoints/*.pt")) or any(path.glob("model_[0-9]*.pt"))
+
+
+def run_folder(source: Path) -> Path:
+    """Return the folder of the training run that a checkpoint (.pt) belongs to; any other path unchanged."""
+    if source.suffix != ".pt":
+        return source
+    return source.parent if RSL_RL.fullmatch(source.name) else source.parents[1]
+
+
+def newest_run(source: str | Path) -> str | Path:
+    """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged."""
+    path = Path(source)
+    if _own_policy(path) or not path.is_dir():
+        return source
+    return newest(filter(is_run, path.glob("*/"))) or source
+
+
+def _no_policy(text: str, path: Path) -> str:
+    """Return the error message for a name or path that is no policy: the task's policies, or similar names."""
+    if path.is_file():
+        return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
+    if len(path.parts) > 1 or path.suffix:
+        return f"{path}: no such folder (policy)"
+    tasks = policy_tasks()
+    task = task_name(text)
+    if task is not None:
+        names = ", ".join(policy for policy, trained_on in tasks.items() if trained_on == task)
+        hint = f"its policies: {names}" if names else f"it has no policy yet: jumper train {task} trains one"
+        return f"{text!r} is a task, not a policy; {hint}"
+    return f"no policy {text!r:.60}{suggestion(text, tasks) or '; there are ' + ', '.join(tasks)}"
+
+
+# ---------------------------------------------------------------------- files
+
+
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the verified content of a policy's files by name, also while another process updates them.
+
+    Pictures may be missing. Raises PolicyError: another file is missing, one is truncated or altered, or the manifest
+    is malformed or of another version.
+    """
+    path = folder / MANIFEST
+    while True:
+        data = read_file(path, PURPOSE, error=PolicyError)
+        try:
+            return _verified(folder, parse_object(path, data))
+        except PolicyError:
+            if read_file(path, PURPOSE, error=PolicyError) == data:
+                raise
+
+
+def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the files of a policy's folder that its manifest lists. Raises PolicyError as `read_files`."""
+    path = folder / MANIFEST
+    if manifest.get("format") != FORMAT:
+        raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
+    check_version(path, manifest)
+    saved = manifest["sha256"]
+    updating = manifest.get("updating", {})
+    files = {}
+    for name in {CONFIG: "", ONNX: "", **saved, **updating}:
+        if (name.endswith(PICTURES) or name not in saved) and not (folder / name).exists():
+            continue
+        files[name] = read_file(folder / name, PURPOSE, error=PolicyError)
+        if hashlib.sha256(files[name]).hexdigest() not in (saved.get(name), updating.get(name)):
+            raise PolicyError(f"{folder / name}: truncated or altered, its SHA-256 is not the manifest's")
+    return files
+
+
+def write_files(folder: Path, files: Mapping[str, bytes], old: Mapping[str, bytes]) -> None:
+    """Write files of a policy (name to content) and its manifest; old: the folder's files, which the manifest keeps.
+
+    Raises OSError: the disk is full or the folder cannot be written.
+    """
+    present = {name: hashlib.sha256(data).hexdigest() for name, data in old.items()}
+    written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}
+    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": present}
+    if old:
+        write_atomically(folder / MANIFEST, json_bytes(manifest | {"updating": written}))
+    for name, data in files.items():
+        write_atomically(folder / name, data)
+    write_atomically(folder / MANIFEST, json_bytes(manifest | {"sha256": dict(sorted((present | written).items()))}))
+
+
+def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Add or replace files of a policy, such as its metrics or plots, after verifying the folder.
+
+    Raises PolicyError: the folder is not an intact policy. OSError as `write_files`.
+    """
+    with directory_lock(folder.resolve().parent):
+        write_files(folder, files, read_files(folder))
+
+
+def check_version(path: Path, content: Mapping[str, Any]) -> None:
+    """Raise PolicyError unless a JSON file's content has the present schema version."""
+    if (version := content.get("schema_version")) != SCHEMA_VERSION:
+        raise PolicyError(f"{path}: {version_error(f'{version!r:.20}', SCHEMA_VERSION)}")
+
+
+def parse_object(path: Path, data: bytes) -> Json:
+    """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none."""
+    content = parse_json(data, str(path), PolicyError)
+    if not isinstance(content, dict):
+        raise PolicyError(f"{path}: not a JSON object")
+    return content
+
+
+# ---------------------------------------------------------------------- summary
 
 
 @dataclass(frozen=True)
@@ -36,11 +192,11 @@ class PolicySummary:
     task: str
     about: str  # First paragraph of README.md, without markup
     size_bytes: int  # Size of policy.onnx
-    rows: list[dict[str, Any]]
+    rows: list[Json]
     """Metrics by condition, as in metrics.json: condition, seed, conditions, metrics; empty: not evaluated."""
 
     @property
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Json:
         """Metrics of the policy's first test condition, as in metrics.json; may be empty.
 
         In the project's policies this is the nominal robot.
@@ -55,92 +211,28 @@ class PolicySummary:
         return rates[0] if rates else None if falls is None else 1.0 - falls
 
     @property
-    def error(self) -> dict[str, Any] | None:
+    def error(self) -> Json | None:
         """Error in the first test condition, such as the mean apex error, as in metrics.json; None: not evaluated."""
         return next((self.metrics[key] for key in ERRORS if key in self.metrics), None)
-
-
-def find_policy(name: str | Path) -> Path:
-    """Return the folder of a policy: the project's policy called `name` (- counts as _), else `name` as a path.
-
-    Raises PolicyError: there is no such policy or folder, or it is that of a training without a checkpoint.
-    """
-    path = Path(name)
-    if own := _own_policy(path):
-        return own
-    if not path.is_dir():
-        raise PolicyError(_no_policy(str(name), path))
-    runs = [file.parent for pattern in (METRICS_FILE, f"*/{METRICS_FILE}") for file in path.glob(pattern)]
-    if runs and not any(map(is_run_folder, runs)):
-        raise PolicyError(f"{path}: no checkpoint yet; a training saves them at its end and each --save-interval")
-    return path
-
-
-def _own_policy(name: Path) -> Path | None:
-    """Return the folder of the project's policy of this name (- counts as _), None: there is none."""
-    folder = POLICIES / str(name).replace("-", "_")
-    return folder if len(name.parts) == 1 and (folder / MANIFEST).is_file() else None
-
-
-def is_run_folder(folder: Path) -> bool:
-    """Return whether a folder holds checkpoints of a training, also of rsl-rl."""
-    return any(folder.glob("checkpoints/*.pt")) or any(folder.glob("model_[0-9]*.pt"))
-
-
-def newest_run(source: str | Path) -> str | Path:
-    """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged."""
-    path = Path(source)
-    if _own_policy(path) or not path.is_dir():
-        return source
-    return newest(filter(is_run_folder, path.glob("*"))) or source
-
-
-def _no_policy(text: str, path: Path) -> str:
-    """Return the error message for a name or path that is no policy: the task's policies, or similar names."""
-    if path.is_file():
-        return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
-    if len(path.parts) > 1 or path.suffix:
-        return f"{path}: no such folder (policy)"
-    tasks, task = policy_tasks(), task_name(text)
-    if task is not None:
-        names = ", ".join(policy for policy, trained_on in tasks.items() if trained_on == task)
-        hint = f"its policies: {names}" if names else f"it has no policy yet: jumper train {task} trains one"
-        return f"{text!r} is a task, not a policy; {hint}"
-    return f"no policy {text!r:.60}{suggestion(text, tasks) or '; there are ' + ', '.join(tasks)}"
 
 
 def summarise(folder: Path) -> PolicySummary:
     """Return a policy's metrics and description, after verifying its files.
 
-    Raises PolicyError: it is no policy, or a file is missing, altered or malformed, or a link to another folder.
+    Raises PolicyError: it is no policy, or a file is missing, altered or malformed.
     """
     try:
-        files, readme = read_files(folder).content, folder / README
-        interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG]).get("interface"))
-        if METRICS not in files and os.path.lexists(folder / METRICS):
-            raise PolicyError(f"{METRICS} is not in {MANIFEST}")
-        if os.path.dirname(os.path.realpath(readme)) != os.path.realpath(folder):
-            raise PolicyError(f"{README} is a link to another folder")
-        about = first_paragraph(read_file(readme, "page").decode()) if os.path.lexists(readme) else ""
+        files = read_files(folder)
+        interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG])["interface"])
+        readme = folder / README
+        about = first_paragraph(readme.read_text()) if readme.is_file() else ""
         saved = parse_object(folder / METRICS, files[METRICS]) if METRICS in files else {"rows": []}
         rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
-        for row in rows:
-            _check_row(row)
         return PolicySummary(folder.resolve().name, folder, interface.task, about, len(files[ONNX]), rows)
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-    raise PolicyError(f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run")
-
-
-def _check_row(row: dict[str, Any]) -> None:
-    """Raise PolicyError, or LookupError or such, unless metrics in one condition are as in docs/metrics.schema.json."""
-    metrics = row["metrics"].values()
-    numbers = [metric["value"] for key, metric in row["metrics"].items() if key in (*SUCCESSES, *ERRORS, "fall_rate")]
-    valid = isinstance(row["condition"], str) and isinstance(row["conditions"], dict) and metrics
-    valid = valid and all(type(number) in (int, float, type(None)) for number in numbers)
-    valid = valid and all(type(metric["trials"]) in (int, type(None)) for metric in metrics)
-    if not valid or not all(isinstance(metric["unit"], str | None) for metric in metrics):
-        raise PolicyError(f"{METRICS}: metrics of another type than docs/metrics.schema.json has")
+        message = f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run"
+        raise PolicyError(message) from error
 
 
 def first_paragraph(markdown: str) -> str:

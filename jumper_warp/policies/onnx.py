@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,12 @@ import torch
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
-from jumper_warp.policies.policy import Policy, check_tensors
-from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyError, PolicyInterface, checksum_entry
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyError, PolicyInterface
 
 OPSET = 18
 IR_VERSION = 9
-INPUT, OUTPUT = "obs", "actions"
+INPUT, OUTPUT = "obs", "actions"  # Names of the graph's input and output
+MAX_OUTPUT = 1.0e38  # Bound of layer outputs, below the largest float32
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 NORMALISER_TENSORS = {"mean": "normaliser.mean", "std": "normaliser.std"}
 """Names of the normaliser's tensors in `Policy.tensors`, by ONNX initialiser."""
@@ -52,10 +50,12 @@ class _GraphBuilder:
 
     def weight(self, layer: int, value: np.ndarray) -> str:
         """Add a layer's weight, (out, in), to the graph; two equal blocks on its diagonal are stored once."""
-        name, block = f"actor_{layer}_weight", _repeated_block(value)
+        name = f"actor_{layer}_weight"
+        block = _repeated_block(value)
         if block is None:
             return self.constant(name, value)
-        stored, columns = self.constant(f"actor_{layer}_block", block), block.shape[1]
+        stored = self.constant(f"actor_{layer}_block", block)
+        columns = block.shape[1]
         halves = []
         for half, pads in (("upper", (0, 0, 0, columns)), ("lower", (0, columns, 0, 0))):
             pads_name = self.constant(f"{name}_{half}_pads", pads, np.int64)
@@ -76,13 +76,14 @@ def _repeated_block(weight: np.ndarray) -> np.ndarray | None:
     return np.ascontiguousarray(weight[:rows, :columns]) if same else None
 
 
-def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.ModelProto:
+def onnx_model(
+    tensors: Mapping[str, torch.Tensor], interface: PolicyInterface, config: Mapping[str, Any]
+) -> onnx.ModelProto:
     """Return the ONNX model of a policy: `obs` (batch, num_obs) to `actions` (batch, num_actions), clipped to ±1.
 
-    config: configuration with the commit for the metadata (default: the policy's own).
+    tensors: of normaliser and layers, see `Policy.tensors`. config: configuration with the commit for the metadata.
     """
-    interface = policy.interface
-    tensors = {name: tensor.numpy() for name, tensor in policy.tensors().items()}
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     graph = _GraphBuilder()
     zero = graph.constant("zero", 0.0)
 
@@ -94,13 +95,13 @@ def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.
     non_finite = graph.add("Or", [graph.add("IsNaN", [INPUT], "nan"), graph.add("IsInf", [INPUT], "infinite")], "bad")
     value = graph.add("Where", [non_finite, zero, INPUT], "finite")
     value = clip(value, interface.observation_limit, "limited")
-    value = graph.add("Sub", [value, graph.constant("mean", tensors["normaliser.mean"])], "centred")
-    value = graph.add("Div", [value, graph.constant("std", tensors["normaliser.std"])], "normalised")
+    value = graph.add("Sub", [value, graph.constant("mean", arrays["normaliser.mean"])], "centred")
+    value = graph.add("Div", [value, graph.constant("std", arrays["normaliser.std"])], "normalised")
     value = clip(value, interface.normalised_limit, "features")
     last = len(interface.sizes) - 2
     for i in range(last + 1):
-        weight = graph.weight(i, tensors[f"actor.{i}.weight"])
-        bias = graph.constant(f"actor_{i}_bias", tensors[f"actor.{i}.bias"])
+        weight = graph.weight(i, arrays[f"actor.{i}.weight"])
+        bias = graph.constant(f"actor_{i}_bias", arrays[f"actor.{i}.bias"])
         value = graph.add("Gemm", [value, weight, bias], f"linear_{i}", transB=1)
         if i < last:
             value = graph.add(OPERATORS[interface.activation], [value], f"activation_{i}")
@@ -112,18 +113,17 @@ def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.
     model = helper.make_model(
         network, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="jumper-warp"
     )
-    helper.set_model_props(model, metadata(policy, policy.config if config is None else config))
+    helper.set_model_props(model, metadata(interface, config))
     return model
 
 
-def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
+def metadata(interface: PolicyInterface, config: Mapping[str, Any]) -> dict[str, str]:
     """Return the entries of the ONNX model's metadata, strings by key.
 
     `jumper_warp` is JSON with the whole `PolicyInterface`. The other entries repeat parts of it, comma-separated and
     unrounded, under the names that common deployment tools read. The network has no internal state: past frames are
     part of the observation, see `observation_layout`.
     """
-    interface = policy.interface
     joints = ("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
     lists = {name: getattr(interface, name) for name in (*joints, "observation_names")}
     commit = {key: config.get(key) for key in SOURCE_KEYS}
@@ -132,63 +132,73 @@ def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
     return entries | {"jumper_warp": json.dumps(full, ensure_ascii=False, allow_nan=False)}
 
 
-def onnx_bytes(policy: Policy, config: Mapping[str, Any] | None = None) -> bytes:
+def onnx_bytes(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface, config: Mapping[str, Any]) -> bytes:
     """Return a policy as the bytes of an ONNX file, validated and deterministic; arguments: see `onnx_model`."""
-    model = onnx_model(policy, config)
+    model = onnx_model(tensors, interface, config)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 
 
-def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> Policy:
-    """Load the policy in an ONNX file; inverts `onnx_bytes` bitwise.
+def tensors_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Return the tensors of a policy's ONNX file, float32, by the names of `Policy.tensors`; inverts `onnx_bytes`.
 
     data: content of the file. interface, config: from config.json; graph and metadata must agree with them.
-    Raises PolicyError: the file is damaged, its weights are not valid for the interface, or its graph, opset or
-    metadata differ from the result of `onnx_model`.
+    Raises PolicyError: the file is damaged, its tensors do not fit the interface (see `check_tensors`), or its graph,
+    opset or metadata differ from the result of `onnx_model`.
     """
     model = onnx.ModelProto()
     try:
         model.ParseFromString(data)
-    except DecodeError as error:
+        tensors = dict(map(_read_tensor, filter(_is_tensor, model.graph.initializer)))
+    except (DecodeError, ValueError) as error:
         raise PolicyError(f"the ONNX file cannot be read ({error!s:.100})") from error
-    tensors = _read_tensors(model.graph.initializer)
     check_tensors(tensors, interface)
-    layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
-    policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
-    if onnx_model(policy).SerializeToString(deterministic=True) != model.SerializeToString(deterministic=True):
+    rebuilt = onnx_model(tensors, interface, config)
+    if rebuilt.SerializeToString(deterministic=True) != model.SerializeToString(deterministic=True):
         raise PolicyError("the graph or metadata of the ONNX file differs from that of its weights and config.json")
-    return policy
-
-
-def _read_tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor]:
-    """Return the tensors of normaliser and layers in initialisers, float32, by the names of `Policy.tensors`.
-
-    Raises PolicyError: an initialiser is malformed.
-    """
-    tensors = {}
-    for stored in initialisers:
-        layer = LAYER_INITIALISER.fullmatch(str(stored.name))  # protobuf returns bytes if a name is not UTF-8
-        if layer is None and stored.name not in NORMALISER_TENSORS:
-            continue
-        name = NORMALISER_TENSORS[stored.name] if layer is None else f"actor.{layer[1]}.{layer[2]}"
-        if stored.data_type != TensorProto.FLOAT:
-            raise PolicyError(f"{name} must hold floating-point numbers of 32 bits")
-        try:
-            tensor = torch.from_numpy(np.frombuffer(stored.raw_data, "<f4").reshape(tuple(stored.dims)).copy())
-        except (ValueError, OverflowError) as error:
-            raise PolicyError(f"{name}: number of values does not match its shape") from error
-        if name.endswith(".block"):
-            if tensor.dim() != 2:
-                raise PolicyError(f"{name} must be a matrix, got shape {tuple(tensor.shape)!s:.60}")
-            name, tensor = name.replace("block", "weight"), torch.block_diag(tensor, tensor)
-        tensors[name] = tensor
     return tensors
 
 
-def export_onnx(policy: Policy, path: Path) -> Path:
-    """Write a policy as one ONNX file with its checksum, atomically, and return its path."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = onnx_bytes(policy)
-    write_atomically(path, data + checksum_entry(data))
-    return path
+def _is_tensor(stored: TensorProto) -> bool:
+    """Return whether an initialiser holds a tensor of the normaliser or of a layer."""
+    return stored.name in NORMALISER_TENSORS or LAYER_INITIALISER.fullmatch(stored.name) is not None
+
+
+def _read_tensor(stored: TensorProto) -> tuple[str, torch.Tensor]:
+    """Return the name (see `Policy.tensors`) and the value of an initialiser; a repeated block becomes the weight."""
+    tensor = torch.from_numpy(numpy_helper.to_array(stored).copy())
+    name = NORMALISER_TENSORS.get(stored.name) or stored.name.replace("_", ".")
+    if name.endswith(".block"):
+        return name.replace("block", "weight"), torch.block_diag(tensor, tensor)
+    return name, tensor
+
+
+def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
+    """Raise PolicyError unless names (see `Policy.tensors`), shapes and values of tensors fit an interface."""
+    sizes = interface.sizes
+    expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
+    for i in range(len(sizes) - 1):
+        expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
+    different = sorted(set(expected) ^ set(tensors))
+    if different:
+        raise PolicyError(f"configured layers are {sizes}; missing or unknown: {', '.join(different):.200}")
+    for name, shape in expected.items():
+        tensor = tensors[name]
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+            raise PolicyError(f"{name} must be float32 of shape {shape}, got {tensor.dtype} of {tuple(tensor.shape)}")
+        if not tensor.isfinite().all():
+            raise PolicyError(f"{name} is not finite")
+    if not (tensors["normaliser.std"] > 0.0).all():
+        raise PolicyError("normaliser.std must be positive")
+    _check_overflow(tensors, interface)
+
+
+def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
+    """Raise PolicyError if a layer's output could overflow float32 for some observation, by interval bounds."""
+    bound = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
+    for i in range(len(interface.sizes) - 1):
+        bound = tensors[f"actor.{i}.weight"].double().abs() @ bound + tensors[f"actor.{i}.bias"].double().abs()
+        if not bound.max() < MAX_OUTPUT:
+            raise PolicyError(f"the weights of layer {i} are so large that its outputs may overflow")
+        # an activation's output is at most its input, or 1
+        bound = torch.ones_like(bound) if interface.activation == "tanh" else bound.clamp(min=1.0)

@@ -1,23 +1,73 @@
-"""Trained policies: actor networks with their observation normalisers."""
+"""Trained policies: actor networks with their observation normalisers; loading, saving, blending and warm starts.
+
+`Policy.load` reads the project's policies, folders, checkpoints and runs; `save_policy` writes a folder.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import zip_longest
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import nn
 
-from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.envs.vec_env import RAW_LIMIT
+from jumper_warp.policies.catalog import (
+    CONFIG,
+    MANIFEST,
+    ONNX,
+    README,
+    RSL_RL,
+    SCHEMA_VERSION,
+    check_version,
+    find_policy,
+    is_run,
+    newest_run,
+    parse_object,
+    read_files,
+    run_folder,
+    write_files,
+)
+from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_onnx
+from jumper_warp.policies.spec import PolicyError, PolicyInterface, checksum_entry, make_interface
 from jumper_warp.recipe import Recipe
-from jumper_warp.rl.mirror import Weights
-from jumper_warp.rl.networks import ACTIVATIONS, linear_layers
+from jumper_warp.rl import checkpoint as checkpoints
+from jumper_warp.rl.actor_init import ActorInit, make_actor_init, rescale_inputs
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
+from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
+from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
+from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.tasks import saving
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.interface import interface
+from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, read_json, write_atomically
 from jumper_warp.utils.normalise import normalise
+from jumper_warp.utils.runtime import source_versions
 
-MAX_OUTPUT = 1.0e38  # Bound of layer outputs, below the largest float32
+FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
+RSL_RL_EPS = 0.01  # rsl-rl adds this to the standard deviation of observations
+RSL_RL_LIMIT = 1.0e6  # Bound of normalised observations, which rsl-rl does not clip
+CURVE = (
+    "iteration",
+    "Perf/elapsed_s",
+    "Train/mean_reward",
+    "Train/mean_episode_length",
+    "Metrics/success",
+    "Metrics/score",
+)
+"""Columns of a saved learning curve."""
+CURVE_ROWS = 60  # Maximum number of rows of a saved learning curve, evenly spaced
 
 
 class _Linear(nn.Linear):
@@ -34,9 +84,13 @@ class Policy(nn.Module):
     std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
 
     def __init__(
-        self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
+        self,
+        layers: Weights,
+        mean: torch.Tensor,
+        std: torch.Tensor,
+        interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Create a policy from copies of the tensors, as float32.
 
         layers: weight (out, in) and bias (out,) of each layer. mean, std: (num_obs,) of raw observations. interface:
@@ -47,10 +101,7 @@ class Policy(nn.Module):
         super().__init__()
         self.interface = interface
         self.config = dict(config or {})
-        tensors = {"normaliser.mean": mean, "normaliser.std": std}
-        for i, (weight, bias) in enumerate(layers):
-            tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
-        tensors = {name: tensor.detach().float().cpu().clone() for name, tensor in tensors.items()}
+        tensors = {name: tensor.detach().float().cpu().clone() for name, tensor in _named(layers, mean, std).items()}
         check_tensors(tensors, interface)
         self.register_buffer("mean", tensors["normaliser.mean"])
         self.register_buffer("std", tensors["normaliser.std"])
@@ -58,11 +109,36 @@ class Policy(nn.Module):
         for i in range(len(layers)):
             weight = tensors[f"actor.{i}.weight"]
             linear = _Linear(weight.shape[1], weight.shape[0], device="cpu")
-            linear.weight.data, linear.bias.data = weight, tensors[f"actor.{i}.bias"]
+            linear.weight.data = weight
+            linear.bias.data = tensors[f"actor.{i}.bias"]
             self.actor.append(linear)
             if i < len(layers) - 1:
                 self.actor.append(ACTIVATIONS[interface.activation]())
         self.requires_grad_(False)
+
+    @classmethod
+    def load(cls, source: str | Path, *, newest: bool = False) -> Policy:
+        """Load a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
+
+        A task's log folder, `logs/TASK`, stands for its newest run with a checkpoint.
+        newest: whether to use the newest checkpoint of a run, not the best; of rsl-rl's runs it is always the newest.
+        rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
+        Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
+        """
+        source = newest_run(source)
+        if is_run(source):
+            return _policy_of_run(Path(source), newest)
+        folder = find_policy(source)
+        files = read_files(folder)
+        config = parse_object(folder / CONFIG, files[CONFIG])
+        check_version(folder / CONFIG, config)
+        try:
+            spec = PolicyInterface.from_json(config.get("interface"))
+            tensors = tensors_from_onnx(files[ONNX], spec, config)
+        except PolicyError as error:
+            raise PolicyError(f"{folder}: {error}") from error
+        layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(spec.sizes) - 1)]
+        return cls(layers, tensors["normaliser.mean"], tensors["normaliser.std"], spec, config)
 
     def recipe(self, modules: Iterable[ModuleType] = ()) -> Recipe:
         """Return the recipe of the policy's training, from its configuration; see `Recipe.from_json`.
@@ -85,10 +161,8 @@ class Policy(nn.Module):
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return all tensors on the CPU, by name: normaliser.mean, normaliser.std, actor.N.weight, actor.N.bias."""
-        tensors = {"normaliser.mean": self.mean, "normaliser.std": self.std}
-        for i, (weight, bias) in enumerate(self.layers):
-            tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
-        return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        named = _named(self.layers, self.mean, self.std)
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in named.items()}
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
@@ -109,32 +183,268 @@ class Policy(nn.Module):
         return self.actor(normalise(finite, self.mean, self.std, limit)).clamp(-1.0, 1.0)
 
 
-def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise PolicyError unless names (see `Policy.tensors`), shapes and values of tensors fit an interface."""
-    sizes = interface.sizes
-    expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
-    for i in range(len(sizes) - 1):
-        expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
-    different = sorted(set(expected) ^ set(tensors))
-    if different:
-        raise PolicyError(f"configured layers are {sizes}; missing or unknown: {', '.join(different):.200}")
-    for name, shape in expected.items():
-        tensor = tensors[name]
-        if tuple(tensor.shape) != shape:
-            raise PolicyError(f"{name} must have the configured shape {shape}, got {tuple(tensor.shape)}")
-        if not tensor.isfinite().all():
-            raise PolicyError(f"{name} is not finite")
-    if not (tensors["normaliser.std"] > 0.0).all():
-        raise PolicyError("normaliser.std must be positive")
-    _check_overflow(tensors, interface)
+def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
+    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `Policy.load`."""
+    return Policy.load(name).to(device)
 
 
-def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise PolicyError if a layer's output could overflow float32 for some observation, by interval bounds."""
-    bound = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
-    for i in range(len(interface.sizes) - 1):
-        bound = tensors[f"actor.{i}.weight"].double().abs() @ bound + tensors[f"actor.{i}.bias"].double().abs()
-        if not bound.max() < MAX_OUTPUT:
-            raise PolicyError(f"the weights of layer {i} are so large that its outputs may overflow")
-        # an activation's output is at most its input, or 1
-        bound = torch.ones_like(bound) if interface.activation == "tanh" else bound.clamp(min=1.0)
+def _named(layers: Weights, mean: torch.Tensor, std: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return the tensors of a policy by the names of `Policy.tensors`."""
+    tensors = {"normaliser.mean": mean, "normaliser.std": std}
+    for i, (weight, bias) in enumerate(layers):
+        tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
+    return tensors
+
+
+# ---------------------------------------------------------------------- training runs
+
+
+def _policy_of_run(source: Path, newest: bool) -> Policy:
+    """Load the policy of a checkpoint or of a run's folder; arguments and errors: see `Policy.load`."""
+    foreign = {int(match[1]): path for path in source.glob("model_*.pt") if (match := RSL_RL.fullmatch(path.name))}
+    path = foreign[max(foreign)] if foreign else source
+    read = _policy_of_checkpoint
+    if RSL_RL.fullmatch(path.name):
+        file = path.with_name(CONFIG)
+        if not file.exists():
+            raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config")
+        config = read_json(file, "settings of a run", error=CheckpointError)
+        state = checkpoints.load_foreign_checkpoint(path) | {"config": config}
+        read = _policy_of_rsl_rl
+    elif path.suffix != ".pt" and newest:
+        path, state, *_ = checkpoints.latest_checkpoint(path / CHECKPOINTS)
+    else:
+        path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
+        state = checkpoints.load_checkpoint(path)
+    try:
+        return read(state)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from error
+    except TaskError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    except DECODE_ERRORS as error:
+        reason = f"{type(error).__name__}: {one_line_message(error)}"
+        raise CheckpointError(f"{path}: not a training checkpoint of this project ({reason})") from error
+
+
+def _policy_of_rsl_rl(state: Json) -> Policy:
+    """Return the policy in a checkpoint of rsl-rl 5, to which `config` (`env`, perhaps `train`) is added."""
+    config = state["config"]
+    actor = state["actor_state_dict"]
+    layers = _actor_layers(actor, "mlp.")
+    mean = torch.zeros(layers[0][0].shape[1])
+    std = torch.ones_like(mean)
+    if "obs_normalizer._mean" in actor:
+        mean = actor["obs_normalizer._mean"][0]
+        std = actor["obs_normalizer._std"][0] + RSL_RL_EPS
+    activation = config.get("train", {}).get("ppo", {}).get("activation", "elu")
+    return _policy_of_weights(config, int(state["iter"]), layers, mean, std, activation, RSL_RL_LIMIT)
+
+
+def _policy_of_checkpoint(state: Json) -> Policy:
+    """Return the policy in a checkpoint of this package; a mirror-symmetric actor becomes a plain network."""
+    config = parse_json(state["config"], "config")
+    model = state["ppo"]["model"]
+    layers = _actor_layers(model, "actor.")
+    if any(name.startswith("mirror_") for name in model):
+        parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
+        layers = expand_layers(layers, Symmetry(*(mirror_map(*part) for part in parts)))
+    mean = model["obs_moments.mean"].float()
+    std = (model["obs_moments.var"] + VARIANCE_EPS).sqrt().float()
+    activation = config["train"]["ppo"]["activation"]
+    return _policy_of_weights(config, state["iteration"], layers, mean, std, activation, NORMALISED_LIMIT)
+
+
+def _policy_of_weights(
+    config: Json, iteration: int, layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, limit: float
+) -> Policy:
+    """Return the policy of a training, with the code version of its run and the iteration in the configuration.
+
+    limit: normalised observations are clamped to ± this. Raises TaskError: its task has another version; PolicyError:
+    interface, layers and statistics contradict each other.
+    """
+    env = config["env"]
+    saving.check_version(env["task"])
+    commit = config.get("commit") or {"hash": None, "dirty": None}
+    spec = make_interface(
+        {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": limit},
+        policy_dt=env["policy_dt_s"],
+        physics_dt=env["physics_dt_s"],
+        hidden=tuple(len(bias) for _, bias in layers[:-1]),
+        activation=activation,
+    )
+    source = {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": iteration}
+    return Policy(layers, mean, std, spec, {**config, **source})
+
+
+def _actor_layers(model: Json, prefix: str) -> Weights:
+    """Return weight (out, in) and bias (out,) of the actor's layers, first to last, from a model's state_dict."""
+    names = [key for key in model if key.startswith(prefix) and key.endswith(".weight")]
+    names.sort(key=lambda key: int(key.split(".")[1]))
+    return [(model[name], model[name.removesuffix("weight") + "bias"]) for name in names]
+
+
+def learning_curve(source: Path) -> bytes | None:
+    """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
+    path = run_folder(source) / METRICS_FILE
+    return thinned_curve(read_file(path, "metrics of a run")) if path.is_file() else None
+
+
+def thinned_curve(metrics: bytes) -> bytes:
+    """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
+
+    The lines are evenly spaced. The first and the last line are included, partial lines are omitted.
+    """
+    whole = [json.loads(line) for line in metrics.splitlines() if line.endswith(b"}")]
+    rows = [{name: row[name] for name in CURVE if name in row} for row in whole]
+    last = len(rows) - 1
+    kept = rows if last < CURVE_ROWS else [rows[round(i * last / (CURVE_ROWS - 1))] for i in range(CURVE_ROWS)]
+    return "".join(f"{json.dumps(row)}\n" for row in kept).encode()
+
+
+# ---------------------------------------------------------------------- saving
+
+
+def save_policy(
+    folder: Path, policy: Policy, *, files: Mapping[str, bytes] | None = None, overwrite: bool = False
+) -> Path:
+    """Write a policy to a folder atomically, and return the folder's path.
+
+    Commit and versions are added to the configuration if it has none. files: content of additional files by name.
+    overwrite: whether to replace an existing policy with all its files.
+    Raises PolicyError: the folder exists and overwrite is not set, or it is not a policy's.
+    """
+    folder = checked_folder(folder, overwrite)
+    config = {**source_versions(), **policy.config}
+    config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
+    content = {
+        **(files or {}),
+        CONFIG: json_bytes(config),
+        ONNX: onnx_bytes(policy.tensors(), policy.interface, config),
+        README: default_readme(policy.interface).encode(),
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
+        new = Path(aside, "new")
+        old = Path(aside, "old")
+        new.mkdir()
+        write_files(new, content, {})
+        with directory_lock(folder.parent):
+            if folder.exists():
+                os.replace(folder, old)
+            try:
+                os.replace(new, folder)
+            except BaseException:
+                if old.exists():
+                    os.rename(old, folder)
+                raise
+    return folder
+
+
+def checked_folder(folder: Path, overwrite: bool) -> Path:
+    """Return a path for a policy's folder, after checking that a policy can be written there.
+
+    Raises PolicyError: it has no name or the suffix of a file; it exists and overwrite is not set, or is no policy's.
+    """
+    folder = Path(folder)
+    if folder.name in ("", ".."):
+        raise PolicyError(f"a policy's folder needs a name, got {folder}")
+    if folder.suffix.lower() in FILE_SUFFIXES:
+        raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
+    if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
+        reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
+        raise PolicyError(f"{folder} exists{reason}")
+    return folder
+
+
+def default_readme(spec: PolicyInterface) -> str:
+    """Return the text of README.md for a policy's folder: sizes, rate, files and commands."""
+    return (
+        f"# Policy for {spec.task}\n\n"
+        f"Reads {spec.sizes[0]} numbers, drives {spec.sizes[-1]} motors at {1.0 / spec.policy_dt:.0f} Hz.\n"
+        f"`{ONNX}` holds the network with its normaliser, `{CONFIG}` everything that made it.\n\n"
+        "    jumper play FOLDER\n"
+        "    jumper evaluate FOLDER\n"
+    )
+
+
+def export_onnx(policy: Policy, path: Path) -> Path:
+    """Write a policy as one ONNX file with its checksum, atomically, and return its path."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = onnx_bytes(policy.tensors(), policy.interface, policy.config)
+    write_atomically(path, data + checksum_entry(data))
+    return path
+
+
+# ---------------------------------------------------------------------- further training
+
+
+def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
+    """Average the weights of two policies: (1 - fraction) * policy + fraction * other, with the normaliser of `policy`.
+
+    If one was fine-tuned from the other, or both from a third, the interpolated networks are usable policies too, which
+    trade off the strengths of both (Wortsman et al. 2022, Robust fine-tuning of zero-shot models). First the first
+    layer of `other` is rescaled to that normaliser. The configuration is a copy of `policy.config` with the entry
+    `blended`: the keys share (the fraction), and commit and iteration of `other`.
+    fraction: 0 gives `policy`; 1 acts like `other` wherever neither policy clips its normalised observation.
+    Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].
+    """
+    if not 0.0 <= fraction <= 1.0:
+        raise PolicyError(f"the fraction of a blend must be from 0 to 1, got {fraction}")
+    if policy.interface != other.interface:
+        raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
+    rescaled = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
+
+    def interpolate(tensor: torch.Tensor, other_tensor: torch.Tensor) -> torch.Tensor:
+        """Return the weighted mean of two tensors of one shape, float64."""
+        return (1.0 - fraction) * tensor.double() + fraction * other_tensor
+
+    pairs = zip(policy.layers, rescaled, strict=True)
+    layers = [(interpolate(w, other_w), interpolate(b, other_b)) for (w, b), (other_w, other_b) in pairs]
+    origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
+    config = policy.config | {"blended": {"share": fraction, **origin}}
+    return Policy(layers, policy.mean, policy.std, policy.interface, config)
+
+
+def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
+    """Return the initialisation of a training's actor from the policy `source` (see `Policy.load`).
+
+    Observation and joints must agree; action scale, gains, torque limits and time steps may differ.
+    Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
+    observation or joints differ from the task's, or an error of `make_actor_init`.
+    """
+    policy = Policy.load(source)
+    check_interface(policy.interface, interface(task))
+    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
+    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
+
+
+def task_symmetry(task: TaskCfg) -> Symmetry:
+    """Return the left-right mirror maps of a task's actor observation and action."""
+    return Symmetry(mirror_map(*mirror_of(task, "actor"), "observation"), mirror_map(*mirror_of_action(), "action"))
+
+
+def check_interface(policy: PolicyInterface, task: Json) -> None:
+    """Raise InputError with the first difference, if a policy and a task differ in observation or joints.
+
+    task: its description by `jumper_warp.tasks.interface`.
+    """
+    for quantity, policy_value, task_value in _compared_values(policy, task):
+        if policy_value != task_value:
+            raise InputError(f"init_policy: {quantity}: the policy has {policy_value}, the task {task_value}")
+
+
+def _compared_values(policy: PolicyInterface, task: Json) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value)."""
+    for label, field in (("observation", "observation_names"), ("action", "joint_names")):
+        for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):
+            yield f"{label} {column}", names[0], names[1]
+    for name, term in policy.observation_layout.items():  # empty if unknown
+        for key, value in term.items():
+            yield f"{key} of {name}", value, task["observation_layout"].get(name, {}).get(key, "none")
+    angles = zip(policy.joint_names, policy.default_joint_pos, task["default_joint_pos"], strict=True)
+    for joint, angle, task_angle in angles:
+        yield f"default angle [rad] of {joint}", round(angle, 6), round(task_angle, 6)
+    yield "limit of observations", policy.observation_limit, RAW_LIMIT
+    yield "limit of observations in standard deviations", policy.normalised_limit, NORMALISED_LIMIT

@@ -6,10 +6,11 @@ import dataclasses
 import hashlib
 import math
 from dataclasses import dataclass, field
-from typing import Any, get_type_hints
+from typing import Any
 
-from jumper_warp.utils.checks import ACTIVATIONS, MAX_HIDDEN, MAX_WIDTH, NAME, check_angle_limits, check_filter_speed
+from jumper_warp.utils.checks import ACTIVATIONS, NAME, check_angle_limits, check_filter_speed, check_types
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 FULL_TURN = 2.0 * math.pi
 JOINT_BOUNDS = {
@@ -29,8 +30,6 @@ SCALAR_BOUNDS = {
 """Lower and upper bounds of the interface's scalar fields."""
 LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")  # Fields of each term in an observation layout
 FILTERED = ("lateral", "transversal", "sum")  # Angles with limits in a command filter: two motors, and outer + inner
-LIMITS = ("lower", "upper", "lower_zone", "upper_zone")  # Limits of an angle in a command filter [deg]
-MAX_COLUMNS = 100_000  # Largest number of columns of an observation
 MAX_HISTORY = 1000  # Largest number of frames of an observation term
 METADATA_VERSION = 2  # Version of an ONNX file's metadata
 SOURCE_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
@@ -57,12 +56,12 @@ class PolicyInterface:
     joint_stiffness: tuple[float, ...]  # [N m/rad]
     joint_damping: tuple[float, ...]  # [N m s/rad]
     torque_limit: tuple[float, ...]  # [N m]
-    command_filter: dict[str, Any]  # fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]
+    command_filter: Json  # fields of `jumper_warp.robot.motors.FilterCfg`: angles [deg], horizon [s]
     policy_dt: float  # [s] Time between actions
     physics_dt: float  # [s] Physics step of the training
     hidden: tuple[int, ...]  # widths of the hidden layers
     activation: str = "elu"
-    observation_layout: dict[str, Any] = field(default_factory=dict)
+    observation_layout: Json = field(default_factory=dict)
     """Observation terms by name, each with first and end column, scale, clip and history; empty if unknown."""
     observation_limit: float = 100.0  # raw observations are clamped to ± this; entries that are not finite count as 0
     normalised_limit: float = 10.0  # normalised observations are clamped to ± this many standard deviations
@@ -72,8 +71,8 @@ class PolicyInterface:
         """Raise PolicyError if a field is out of range, or fields contradict each other."""
         for name in ("observation_names", "joint_names"):
             names = getattr(self, name)
-            if not names or len(set(names)) < len(names) or len(names) > MAX_COLUMNS:
-                raise PolicyError(f"{name} must be distinct, 1 to {MAX_COLUMNS}")
+            if not names or len(set(names)) < len(names):
+                raise PolicyError(f"{name} must be distinct, at least one")
         for name in (self.task, *self.observation_names, *self.joint_names):
             if not NAME.fullmatch(name):
                 raise PolicyError(f"names may contain letters, digits, _ . - and spaces, got {name!r:.60}")
@@ -86,10 +85,8 @@ class PolicyInterface:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
         if self.physics_dt > self.policy_dt:
             raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
-        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= MAX_WIDTH for width in self.hidden):
-            raise PolicyError(
-                f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}, got {self.hidden!s:.100}"
-            )
+        if not self.hidden or min(self.hidden) < 1:
+            raise PolicyError(f"hidden must name widths of at least one layer, got {self.hidden!s:.100}")
         _check_filter(self.command_filter)
         _check_layout(self.observation_layout, len(self.observation_names))
         if self.activation not in ACTIVATIONS:
@@ -102,7 +99,7 @@ class PolicyInterface:
         """Sizes of observation, hidden layers and action, in this order."""
         return (len(self.observation_names), *self.hidden, len(self.joint_names))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the interface's fields as a JSON object."""
         return dataclasses.asdict(self)
 
@@ -114,73 +111,47 @@ class PolicyInterface:
         """
         if not isinstance(data, dict):
             raise PolicyError("the interface must be a JSON object")
-        hints = get_type_hints(cls)
-        different = sorted(set(data) ^ set(hints))
+        different = sorted(set(data) ^ {spec.name for spec in dataclasses.fields(cls)})
         if different:
             raise PolicyError(f"interface fields missing or unknown: {', '.join(different):.200}")
-        return cls(**{name: _parse_field(name, data[name], str(hint)) for name, hint in hints.items()})
+        values: Json = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
+        try:
+            interface = cls(**values)
+            check_types("interface field", interface)
+        except PolicyError:
+            raise
+        except (InputError, TypeError) as error:
+            raise PolicyError(f"the interface has a field of another type: {error}") from error
+        return interface
 
 
-def _parse_field(name: str, value: Any, hint: str) -> Any:
-    """Convert a JSON value to the type of a hint, such as `tuple[float, ...]`. Raises PolicyError: another type.
-
-    Numbers beyond ±1e300 become infinite. name: the field's, for messages.
-    """
-    kind = next(k for k in ("dict", "str", "float", "int") if k in hint)
-    types = {"str": str, "float": (float, int), "int": int, "dict": dict}[kind]
-    is_tuple = hint.startswith("tuple")
-    values = value if is_tuple and isinstance(value, list) else [value]
-    if is_tuple != isinstance(value, list) or not all(isinstance(v, types) and not isinstance(v, bool) for v in values):
-        expected = f"a list of {kind}" if is_tuple else f"a {kind}"
-        raise PolicyError(f"interface field {name} must be {expected}, got {value!r:.60}")
-    if kind == "float":
-        values = [float(v) if abs(v) < 1.0e300 else math.inf for v in values]
-    return tuple(values) if is_tuple else values[0]
-
-
-def _is_number(value: Any) -> bool:
-    """Return whether a value is a finite number, and not a bool."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e300
-
-
-def _check_filter(fields: dict[str, Any]) -> None:
+def _check_filter(fields: Json) -> None:
     """Raise PolicyError unless a command filter has exactly the fields of `FilterCfg`, with valid values."""
-    expected: dict[str, Any] = {name: dict.fromkeys(LIMITS, 0.0) for name in FILTERED} | {
-        "horizon": 0.0,
-        "speed_floor": 0.0,
-    }
-    for place, known in (("", expected), *((name, expected[name]) for name in FILTERED)):
-        table = fields.get(place) if place else fields
-        if not isinstance(table, dict) or set(table) != set(known):
-            raise PolicyError(f"command_filter{place and ' '}{place} must have the fields {', '.join(known)}")
-        for name, value in table.items():
-            if not isinstance(known[name], dict) and not _is_number(value):
-                raise PolicyError(f"command_filter {name} must be a finite number, got {value!r:.60}")
+    if set(fields) != {*FILTERED, "horizon", "speed_floor"}:
+        raise PolicyError(f"command_filter must have the fields {', '.join(FILTERED)}, horizon, speed_floor")
     try:
         check_filter_speed(fields["horizon"], fields["speed_floor"])
         for name in FILTERED:
             check_angle_limits(name, **fields[name])
-    except InputError as error:
+    except (InputError, TypeError) as error:
         raise PolicyError(f"command_filter: {error}") from error
 
 
-def _check_layout(layout: dict[str, Any], width: int) -> None:
+def _check_layout(layout: Json, width: int) -> None:
     """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps."""
     first = 0
     for name, term in layout.items():
         where = f"observation_layout {name!r:.60}"
-        fields = term if isinstance(term, dict) else {}
-        whole = all(type(fields.get(key)) is int for key in ("first", "end", "history"))
-        if set(fields) != set(LAYOUT_FIELDS) or not whole or not NAME.fullmatch(name):
-            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}; first, end and history whole numbers")
-        if fields["first"] != first or fields["end"] <= first or not 1 <= fields["history"] <= MAX_HISTORY:
+        if set(term) != set(LAYOUT_FIELDS):
+            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}")
+        if term["first"] != first or term["end"] <= first or not 1 <= term["history"] <= MAX_HISTORY:
             raise PolicyError(f"{where} must begin at column {first}, with 1 to {MAX_HISTORY} frames")
-        if (fields["end"] - first) % fields["history"]:
+        if (term["end"] - first) % term["history"]:
             raise PolicyError(f"{where} must hold whole frames")
         for key in ("scale", "clip"):
-            if not _is_number(fields[key]) or not 1.0e-6 <= fields[key] <= 1.0e6:
-                raise PolicyError(f"{where}: {key} must lie in 1e-6 to 1e6, got {fields[key]!r:.60}")
-        first = fields["end"]
+            if not 1.0e-6 <= term[key] <= 1.0e6:
+                raise PolicyError(f"{where}: {key} must lie in 1e-6 to 1e6, got {term[key]!r:.60}")
+        first = term["end"]
     if layout and first != width:
         raise PolicyError(f"observation_layout has {first} columns, the observation {width}")
 
@@ -197,12 +168,7 @@ def checksum_entry(data: bytes) -> bytes:
 
 
 def make_interface(
-    description: dict[str, Any],
-    *,
-    policy_dt: float,
-    physics_dt: float,
-    hidden: tuple[int, ...],
-    activation: str = "elu",
+    description: Json, *, policy_dt: float, physics_dt: float, hidden: tuple[int, ...], activation: str = "elu"
 ) -> PolicyInterface:
     """Return the interface (observation, action, motors, time steps) of policies for a task.
 

@@ -132,7 +132,8 @@ def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
 def shape_corners(shape: Shape) -> np.ndarray:
     """Return the corners (8, 3) [m], in the link frame, of a shape's bounding box along the shape's own axes."""
     if shape.mesh is not None:
-        low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
+        low = shape.mesh.vertices.min(axis=0)
+        high = shape.mesh.vertices.max(axis=0)
     else:
         radius, *length = shape.size
         high = np.array([radius, radius, 0.5 * length[0] if length else radius])

@@ -131,7 +131,8 @@ def tree_layout() -> dict[str, tuple[str, str]]:
 
 def check_loops(description: RobotDescription) -> None:
     """Raise RobotDescriptionError for a loop that does not join a leg's shanks at one point of their -z axes."""
-    file, links = description.path, {link.name for link in description.links}
+    file = description.path
+    links = {link.name for link in description.links}
     for leg, loop in zip(LEGS, description.loops, strict=True):
         part = f"loop {loop.name}"
         for link, expected in ((loop.parent, f"{leg}_inner_shank"), (loop.child, f"{leg}_outer_shank")):
@@ -152,7 +153,8 @@ def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
 def check_leg(description: RobotDescription, leg: str) -> None:
     """Raise RobotDescriptionError for a leg that is no planar five-bar with expected axes and a paw at the ankle."""
     file = description.urdf_path
-    front, side = (1.0 if leg[0] == "F" else -1.0), (1.0 if leg[1] == "L" else -1.0)
+    front = 1.0 if leg[0] == "F" else -1.0
+    side = 1.0 if leg[1] == "L" else -1.0
     names = ("lateral", "outer", "inner", "outer_knee", "inner_knee")
     lateral, outer, inner, outer_knee, inner_knee = (description.joint(f"{leg}_{name}") for name in names)
     axes = {lateral: (side, 0, 0), outer: (0, -front, 0), inner: (0, front, 0)}
@@ -185,7 +187,8 @@ def check_leg(description: RobotDescription, leg: str) -> None:
 
 def check_lengths(description: RobotDescription, leg: str) -> None:
     """Raise RobotDescriptionError for a leg with a length [m] outside `LENGTH` or a paw radius outside `PAW_RADIUS`."""
-    dimensions, urdf = leg_dimensions(description, leg), description.urdf_path
+    dimensions = leg_dimensions(description, leg)
+    urdf = description.urdf_path
     axes = abs(dimensions.outer_x - dimensions.inner_x)
     for file, part, name, value, limits in (
         (urdf, f"joint {leg}_lateral", "hip x", abs(dimensions.hip[0]), LENGTH),
@@ -238,7 +241,8 @@ def check_poses(description: RobotDescription) -> None:
 
     Raises RobotDescriptionError.
     """
-    file, leg = description.path, leg_dimensions(description, "FL")
+    file = description.path
+    leg = leg_dimensions(description, "FL")
     require("default" in description.poses, file, "poses", "expected a pose named default")
     for name, (lateral, transversal) in description.poses.items():
         part = f"pose {name}"

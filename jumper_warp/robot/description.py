@@ -128,7 +128,8 @@ class JsonReader:
             name: self.motor_type(name, self.get(self.root["motor_types"], name, "motor_types", dict))
             for name in self.get(self.root, "motor_types", "", dict)
         }
-        table, motors = self.table_of("motor", MOTOR_JOINTS), []
+        table = self.table_of("motor", MOTOR_JOINTS)
+        motors = []
         for joint in MOTOR_JOINTS:
             name = self.get(table, joint, "motors", str)
             self.require(name in types, f"motor {joint}", f"unknown motor type {name!r:.60}")
@@ -172,7 +173,8 @@ class JsonReader:
     def loops(self) -> tuple[Loop, ...]:
         """Return the four loops that close the legs at the ankles, in leg order, anchors (3,) [m]."""
         names = [f"{leg}_ankle" for leg in LEGS]
-        table, loops = self.table_of("loop", names), []
+        table = self.table_of("loop", names)
+        loops = []
         for name in names:
             loop = self.get(table, name, "loops", dict)
             anchors = (np.array(self.vector(loop, f"{side}_anchor", 3, f"loop {name}")) for side in ("parent", "child"))

@@ -43,9 +43,11 @@ def export_robot(
     for file in mesh_files(robot):
         write_atomically(meshes / file.name, file.read_bytes())
     if kind == "mjcf":
-        path, text = folder / "jumper.xml", mjcf(description, values)
+        path = folder / "jumper.xml"
+        text = mjcf(description, values)
     else:
-        path, text = folder / "jumper.urdf", description.urdf if overlay is None else urdf(robot)
+        path = folder / "jumper.urdf"
+        text = description.urdf if overlay is None else urdf(robot)
         write_atomically(folder / "loop_closures.yaml", loop_closures(robot, standing_angles(robot)).encode())
     write_atomically(path, text.encode())
     return path

@@ -146,7 +146,9 @@ def _write_values(model: Model, robots: RobotValues) -> None:
 
 def other_colliders(model: Model) -> np.ndarray:
     """Return the shape indices (n,) int of the colliding shapes that are neither paws nor the shared ground."""
-    flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
+    flags = model.shape_flags.numpy()
+    worlds = model.shape_world.numpy()
+    kinds = model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
     colliding = np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground)
     return np.array([i for i in colliding if model.shape_label[i].split("/")[-1] not in PAWS], dtype=int)
@@ -182,7 +184,9 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
     Shape (43,), as `joint_q`. Raises KeyError for an unknown pose.
     """
     angles = description.pose(pose).reshape(4, 3)
-    joints, loops, depths = [], [], []
+    joints = []
+    loops = []
+    depths = []
     for name, (lateral, outer, inner) in zip(LEGS, angles, strict=True):
         leg = leg_dimensions(description, name)
         outer_knee, inner_knee, ankle_z = knee_angles(leg, outer, inner)

@@ -97,7 +97,8 @@ class MotorCfg:
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
     """Return a motor type's gains, speeds and torques; commands are limited to `torque` [N m], at most the peak."""
     pd = getattr(motor, gains)
-    saturation, peak = min(torque, motor.peak_torque), motor.peak_torque
+    saturation = min(torque, motor.peak_torque)
+    peak = motor.peak_torque
     return MotorKindCfg(pd.kp, pd.kd, saturation, peak, motor.cutoff_speed, motor.no_load_speed)
 
 
@@ -200,13 +201,15 @@ def horizontal_jump_filter() -> FilterCfg:
 
 def walking_filter() -> FilterCfg:
     """Return the motor command filter for walking: lateral limits at the hard stops, no hard zones inside limits."""
-    lateral, transversal = LimitsCfg(-50.0, 110.0), LimitsCfg(-30.0, 140.0)
+    lateral = LimitsCfg(-50.0, 110.0)
+    transversal = LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 220.0), horizon=5.0 / 60.0)
 
 
 def loose_filter() -> FilterCfg:
     """Return the motor command filter for the highest jumps: limits bind two policy steps ahead, no hard zones."""
-    lateral, transversal = LimitsCfg(-15.0, 15.0), LimitsCfg(-30.0, 140.0)
+    lateral = LimitsCfg(-15.0, 15.0)
+    transversal = LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 
 

@@ -92,7 +92,8 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
     heights = np.zeros((cfg.cols * nodes + 1 + 2 * edge, cfg.rows * nodes + 1 + 2 * edge), dtype=np.float32)
     for i in range(cfg.rows):
         for j, kind in enumerate(cfg.kinds):
-            y, x = edge + j * nodes, edge + i * nodes
+            y = edge + j * nodes
+            x = edge + i * nodes
             rng = np.random.default_rng([cfg.seed, i, j])
             heights[y : y + nodes + 1, x : x + nodes + 1] = tile_heights(cfg, kind, (i + 1) / cfg.rows, rng)
     rows, cols = heights.shape

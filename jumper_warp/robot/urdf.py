@@ -159,7 +159,9 @@ class UrdfReader:
         geometry = self.child(element, "geometry", part)
         known = len(geometry) == 1 and geometry[0].tag in (*SHAPE_SIZES, "mesh")
         self.require(known, part, "expected one box, cylinder, sphere or mesh in <geometry>")
-        kind, size, mesh = geometry[0].tag, [], None
+        kind = geometry[0].tag
+        size = []
+        mesh = None
         if kind == "mesh":
             mesh = self.mesh(geometry[0].get("filename", ""), part)
         else:
@@ -201,7 +203,8 @@ def file_inside(source: Path, name: str, part: str) -> Path:
 
 def read_obj(file: Path) -> TriangleMesh:
     """Read a triangle mesh from a Wavefront OBJ file of `v` and triangular `f` lines. Raises RobotDescriptionError."""
-    vertices, triangles = [], []
+    vertices = []
+    triangles = []
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         word, *values = line.split() or [""]
         try:
@@ -224,5 +227,6 @@ def read_obj(file: Path) -> TriangleMesh:
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Convert a URDF's fixed-axis roll, pitch, yaw [rad] to a quaternion (4,) xyzw."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * angle), math.sin(0.5 * angle)) for angle in (roll, pitch, yaw))
-    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+    x = sr * cp * cy - cr * sp * sy
+    y = cr * sp * cy + sr * cp * sy
     return np.array([x, y, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])

@@ -150,7 +150,8 @@ class UsdStage:
 
         The drive is a motor's, or a knee's damping up to its limit.
         """
-        robot, angle = self.robot, self.angles[hinge.name]
+        robot = self.robot
+        angle = self.angles[hinge.name]
         axis = hinge.axis
         # the joint's x axis turned onto the hinge's axis, which is along x or y
         turn = from_rotation_vector(np.array([0.0, 0.0, np.arctan2(axis[1], axis[0])]))

@@ -49,7 +49,8 @@ class RobotValues:
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
         """Return the values of `count` robots equal to a description (default: the Jumper's): factors 1, offsets 0."""
         robot = load_description() if description is None else description
-        motors, base = robot.motors, robot.links[0]
+        motors = robot.motors
+        base = robot.links[0]
         single = cls(
             base_mass=np.array([base.mass]),
             base_com=np.array(base.com),
@@ -85,7 +86,8 @@ def described(values: RobotValues, description: RobotDescription) -> RobotDescri
     for link in description.links[1:]:
         ratio = ratios[link.name[3:]]
         links.append(replace(link, mass=ratio * link.mass, inertia=ratio * link.inertia))
-    motors, joints = [], {joint.name: joint for joint in description.joints}
+    motors = []
+    joints = {joint.name: joint for joint in description.joints}
     for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
         value = {quantity: float(getattr(values, quantity)[0, index]) for quantity in MOTOR_QUANTITIES}
         motors.append(_described_motor(motor, value))

@@ -81,7 +81,9 @@ class _Descent:
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
-        self.problem, self.lower, self.upper = problem, lower, upper
+        self.problem = problem
+        self.lower = lower
+        self.upper = upper
         device = str(problem.rollout(len(begin)).device)
         self.x = torch.as_tensor(begin, dtype=real, device=device).clamp(lower, upper)
         self.step = torch.full((len(begin),), step, dtype=real, device=device)
@@ -142,7 +144,8 @@ class _Descent:
         """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature."""
         if self.previous is None:
             return
-        moved, change = self.x - self.previous[0], gradient - self.previous[1]
+        moved = self.x - self.previous[0]
+        change = gradient - self.previous[1]
         product = (moved * change).sum(1)
         convex = product > 1.0e-9 * moved.norm(dim=1) * change.norm(dim=1)
         self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(convex, 1.0 / product, 0.0))]
@@ -151,7 +154,9 @@ class _Descent:
         """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
         out = ((self.x <= self.lower) & (gradient > 0.0)) | ((self.x >= self.upper) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
-        d, alphas = free, []  # names as in the book's algorithm 7.4
+        # names as in the book's algorithm 7.4
+        d = free
+        alphas = []
         for moved, change, inverse in reversed(self.pairs):
             alpha = inverse * (moved * d).sum(1)
             d = d - alpha[:, None] * change
@@ -187,7 +192,9 @@ class _Descent:
         candidates = x.detach().cpu().numpy().reshape(len(objective), count, -1)
         diverged = ~np.isfinite(objective)
         feasible = np.where(diverged | (worst > FEASIBLE), np.inf, objective)
-        here, progress, starts = feasible.argmin(1), self.progress, np.arange(len(objective))
+        here = feasible.argmin(1)
+        progress = self.progress
+        starts = np.arange(len(objective))
         least = np.where(diverged, np.inf, worst).argmin(1)
         for start in starts:
             if feasible[start, here[start]] < progress.objective[start]:

@@ -67,7 +67,8 @@ class Network:
         """
         limit, normalised = self.limits
         x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
-        layers, recorded = self.layers(self.weights if weights is None else weights), []
+        layers = self.layers(self.weights if weights is None else weights)
+        recorded = []
         for i, (weight, bias) in enumerate(layers):
             out = functional.linear(x, weight, bias)
             if tape is not None and not out.requires_grad:
@@ -87,7 +88,8 @@ def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
     """
     outs = [out for layers in tape for _, out in layers]
     by_out = torch.autograd.grad(total, outs, retain_graph=True, allow_unused=True)
-    depth, parts = len(tape[0]), []
+    depth = len(tape[0])
+    parts = []
     for layer in range(depth):
         steps = [(layers[layer][0].detach(), by) for layers, by in zip(tape, by_out[layer::depth], strict=True)
                  if by is not None]  # fmt: skip
@@ -104,8 +106,10 @@ def conjugate_gradients(
     x, right: (n,); apply: returns A v for v (n,). Stops after `iterations`, or when the residual's norm is below
     `accuracy` times the norm of `right`.
     """
-    x, residual = torch.zeros_like(right), right.clone()
-    direction, size = residual.clone(), residual @ residual
+    x = torch.zeros_like(right)
+    residual = right.clone()
+    direction = residual.clone()
+    size = residual @ residual
     start = size
     for _ in range(iterations):
         if size <= accuracy**2 * start:
@@ -115,7 +119,8 @@ def conjugate_gradients(
         x += length * direction
         residual -= length * along
         new = residual @ residual
-        direction, size = residual + new / size * direction, new
+        direction = residual + new / size * direction
+        size = new
     return x
 
 

@@ -33,7 +33,8 @@ def flight(motion: SimulatedMotion, speed: float, height: float) -> tuple[torch.
     """
 
     def distance_and_time() -> tuple[torch.Tensor, torch.Tensor]:
-        takeoff, start = motion.momentum_at_takeoff(speed), motion.start
+        takeoff = motion.momentum_at_takeoff(speed)
+        start = motion.start
         landing = height + start.com[:, 2] - motion.q[0, :, 2]
         time = air_time(takeoff.vel[:, 2], takeoff.com[:, 2] - landing, motion.gravity)
         return takeoff.com[:, 0] - start.com[:, 0] + time * takeoff.vel[:, 0], time
@@ -97,7 +98,8 @@ def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Te
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
-        (row, _), (_, time) = motion.takeoff(speed), flight(motion, speed, height)
+        (row, _) = motion.takeoff(speed)
+        (_, time) = flight(motion, speed, height)
         rate = motion.momentum_at_takeoff(speed).spin[:, 1] / motion.start.inertia[:, 1, 1]
         pitch = pitch_of(motion.q[row, torch.arange(motion.num, device=row.device), 3:7]) + rate * time
         return torch.stack([pitch - limit, -limit - pitch])

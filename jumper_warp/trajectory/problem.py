@@ -70,7 +70,8 @@ class Knots:
         weights = torch.as_tensor(self.weights, dtype=x.dtype, device=x.device)
         actions = torch.einsum("tk,nkm->tmn", weights, x.unflatten(1, (len(self.at), self.motors)))
         if self.symmetric:
-            front, hind = actions[:, :2], actions[:, 2:]
+            front = actions[:, :2]
+            hind = actions[:, 2:]
             lateral = torch.zeros_like(front[:, :1])
             actions = torch.cat([lateral, front, lateral, front, lateral, hind, lateral, hind], dim=1)
         scale, middle = (
@@ -87,11 +88,15 @@ class SimulatedMotion:
     """
 
     def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
-        self.trajectory, self.body, self.gravity, self.start = trajectory, body, gravity, start
+        self.trajectory = trajectory
+        self.body = body
+        self.gravity = gravity
+        self.start = start
         """gravity [m/s^2]: downward, positive; start: momentum in row 0, without gradients."""
         self._cache: dict[Any, Any] = {}
         self.dt, self.substeps = rollout.dt, rollout.substeps
-        self.q, self.qd = trajectory.q.movedim(1, -1), trajectory.qd.movedim(1, -1)
+        self.q = trajectory.q.movedim(1, -1)
+        self.qd = trajectory.qd.movedim(1, -1)
         """(steps + 1, num, 19) and (steps + 1, num, 18), coordinates and rates as in `Trajectory`."""
         self.num = self.q.shape[1]
 
@@ -220,7 +225,8 @@ class Problem:
                 model, self.motors, self.command_filter, double=self.double, tolerance=self.tolerance,
                 dt=PHYSICS_DT * SUBSTEPS / self.substeps, substeps=self.substeps, threads=self.threads,
             )  # fmt: skip
-            body, real = WholeBody(rollout), torch.float64 if self.double else torch.float32
+            body = WholeBody(rollout)
+            real = torch.float64 if self.double else torch.float32
             q, qd = (torch.as_tensor(array, dtype=real, device=str(rollout.device)) for array in rollout.standing())
             self._worlds[num_worlds] = _Worlds(rollout, body, q, qd, body.momentum(q.T, qd.T))
         return self._worlds[num_worlds]

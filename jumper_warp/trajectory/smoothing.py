@@ -97,7 +97,9 @@ def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator)
     Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
     shifted in time by up to `SHIFT` knots.
     """
-    whole, rows, shape = x.unflatten(1, (len(knots.at), -1)), np.arange(len(knots.at)), (count, len(x), 1)
+    whole = x.unflatten(1, (len(knots.at), -1))
+    rows = np.arange(len(knots.at))
+    shape = (count, len(x), 1)
     first = np.arange(len(x))[None, :, None]
     second = (first + rng.integers(1, max(2, len(x)), shape)) % len(x)
     ends = rows >= rng.integers(1, len(rows), shape)
@@ -126,13 +128,15 @@ class _BestPoints:
 
     def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):  # x: starts
         self.problem, self.stage = problem, stage
-        self.x, self.merit = x, merit_of(problem, x, stage.merit)
+        self.x = x
+        self.merit = merit_of(problem, x, stage.merit)
 
     def update(self, x: torch.Tensor, slack: float) -> torch.Tensor:
         """Store improved points x (n, len(knots)); return whether each is worse than its best by more than `slack`."""
         merit = merit_of(self.problem, x, self.stage.merit)
         better = merit < self.merit
-        self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)
+        self.x = torch.where(better[:, None], x, self.x)
+        self.merit = torch.where(better, merit, self.merit)
         return (merit > self.merit + slack)[:, None]
 
 
@@ -141,9 +145,11 @@ def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Gene
 
     Gradients are those at randomly displaced points. Returned are the last points or, with finite `slack`, the best.
     """
-    mean, square = torch.zeros_like(x), torch.zeros_like(x)
+    mean = torch.zeros_like(x)
+    square = torch.zeros_like(x)
     best = _BestPoints(problem, x, stage) if stage.slack < inf else None
-    multipliers, scale = _first_multipliers(problem, x, stage), x.new_ones(len(x), 1)
+    multipliers = _first_multipliers(problem, x, stage)
+    scale = x.new_ones(len(x), 1)
     for number in range(stage.iterations):
         decay = max(stage.final_fraction, 1.0 - number / stage.iterations)
         displacement = torch.as_tensor(rng.normal(size=tuple(x.shape)), dtype=x.dtype, device=x.device)
@@ -154,11 +160,13 @@ def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Gene
         gradient *= (LARGEST_GRADIENT / gradient.norm(dim=1, keepdim=True).clamp_min(1.0e-9)).clamp_max(1.0)
         mean = FIRST * mean + (1.0 - FIRST) * gradient
         square = SECOND * square + (1.0 - SECOND) * gradient.square()
-        step, rms = mean / (1.0 - FIRST ** (number + 1)), (square / (1.0 - SECOND ** (number + 1))).sqrt()
+        step = mean / (1.0 - FIRST ** (number + 1))
+        rms = (square / (1.0 - SECOND ** (number + 1))).sqrt()
         x = (x - decay * scale * stage.rate * step / (rms + EPSILON)).clamp(-1.0, 1.0)
         if best is not None and (number + 1) % stage.check_every == 0:
             worse = best.update(x, stage.slack)
-            x, mean = torch.where(worse, best.x, x), torch.where(worse, 0.0, mean)
+            x = torch.where(worse, best.x, x)
+            mean = torch.where(worse, 0.0, mean)
             scale = torch.where(worse, stage.return_scale * scale, scale)
     if best is None:
         return x

@@ -57,13 +57,15 @@ def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
 
 def _rotation_x(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
     """Return rotation matrices (..., 3, 3) about x, given cosine and sine of the angle (...)."""
-    one, zero = torch.ones_like(cos), torch.zeros_like(cos)
+    one = torch.ones_like(cos)
+    zero = torch.zeros_like(cos)
     return torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).unflatten(-1, (3, 3))
 
 
 def _rotation_y(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
     """Return rotation matrices (..., 3, 3) about y, given cosine and sine of the angle (...)."""
-    one, zero = torch.ones_like(cos), torch.zeros_like(cos)
+    one = torch.ones_like(cos)
+    zero = torch.zeros_like(cos)
     return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], dim=-1).unflatten(-1, (3, 3))
 
 
@@ -96,7 +98,8 @@ class WholeBody:
         table = rollout.parameters["table"].numpy()[:, 0].astype(np.float64)
         moments = np.stack([table[moment_rows(body)] for body in range(int(BODIES))])
         moments = torch.as_tensor(moments, dtype=self._real, device=device)
-        self._mass, self._first = moments[:, 0], moments[:, 1:4]
+        self._mass = moments[:, 0]
+        self._first = moments[:, 1:4]
         xx, yy, zz, xy, xz, yz = moments[:, 4:10].unbind(1)
         self._second = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
         self.mass = float(self._mass.sum())  # [kg] of the whole robot
@@ -107,7 +110,8 @@ class WholeBody:
         Rotation (..., 3, 3), origin [m], its velocity [m/s], angular velocity [rad/s]. Arguments q (..., 19), qd (...,
         18). Vectors: (..., 3), world frame.
         """
-        rotation, ang = rotation_matrices(q[..., 3:7]), qd[..., 3:6]
+        rotation = rotation_matrices(q[..., 3:7])
+        ang = qd[..., 3:6]
         vel = qd[..., :3] - _cross(ang, _apply(rotation, (self._first[0] / self._mass[0]).expand_as(ang)))
         return rotation, q[..., :3], vel, ang
 
@@ -119,9 +123,11 @@ class WholeBody:
         """Return poses and velocities of the legs' links. q: (..., 19), qd: (..., 18)."""
         base_rotation, base_pos, base_vel, base_ang = self._base(q, qd)
         base_rotation = base_rotation.unsqueeze(-3)
-        angle, rate = q[..., 7:].unflatten(-1, (4, 3)), qd[..., 6:].unflatten(-1, (4, 3))
+        angle = q[..., 7:].unflatten(-1, (4, 3))
+        rate = qd[..., 6:].unflatten(-1, (4, 3))
         arm = _apply(base_rotation, self._hip.expand(*angle.shape))
-        pos, ang = base_pos.unsqueeze(-2) + arm, base_ang.unsqueeze(-2)
+        pos = base_pos.unsqueeze(-2) + arm
+        ang = base_ang.unsqueeze(-2)
         vel = base_vel.unsqueeze(-2) + _cross(ang, arm)
         rotation = base_rotation @ _rotation_x(angle[..., 0].cos(), self._side * angle[..., 0].sin())
         ang = ang + base_rotation[..., 0] * (self._side * rate[..., 0]).unsqueeze(-1)
@@ -151,13 +157,17 @@ class WholeBody:
         zero = torch.zeros_like(angle[..., 0])
         axis = torch.stack([self._outer_x, self._inner_x], dim=-1)
         thigh, shank = self._thigh[:, None], self._shank[:, None]
-        knee_x, knee_z = axis + self._flip * thigh * angle.sin(), -thigh * angle.cos()
-        span_x, span_z = knee_x[..., OUTER] - knee_x[..., INNER], knee_z[..., OUTER] - knee_z[..., INNER]
+        knee_x = axis + self._flip * thigh * angle.sin()
+        knee_z = -thigh * angle.cos()
+        span_x = knee_x[..., OUTER] - knee_x[..., INNER]
+        span_z = knee_z[..., OUTER] - knee_z[..., INNER]
         span_sq = (span_x**2 + span_z**2).clamp_min(1.0e-8)
         ratio = self._front * ((self._shank**2 - 0.25 * span_sq).clamp_min(1.0e-8) / span_sq).sqrt()
-        ankle_x, ankle_z = knee_x.mean(-1) + ratio * span_z, knee_z.mean(-1) - ratio * span_x
+        ankle_x = knee_x.mean(-1) + ratio * span_z
+        ankle_z = knee_z.mean(-1) - ratio * span_x
         shank_dir = torch.stack([(ankle_x[..., None] - knee_x) / shank, (ankle_z[..., None] - knee_z) / shank], dim=-1)
-        hip_y, knee_y = self._plane_y.expand_as(zero), (self._plane_y + self._knee_y).expand_as(zero)
+        hip_y = self._plane_y.expand_as(zero)
+        knee_y = (self._plane_y + self._knee_y).expand_as(zero)
         origins = []
         for side in (OUTER, INNER):
             origins.append(torch.stack([axis[:, side].expand_as(zero), hip_y, zero], dim=-1))
@@ -173,8 +183,12 @@ class WholeBody:
         frame: velocities (..., 4, 4, 3) [m/s] of the origins of `_planar`; cosines, sines and rates [rad/s] of the
         links' rotation about y, (..., 4, 4) each.
         """
-        sin, cos, thigh, shank = angle.sin(), angle.cos(), self._thigh[:, None], self._shank[:, None]
-        knee_vx, knee_vz = self._flip * thigh * cos * rate, thigh * sin * rate
+        sin = angle.sin()
+        cos = angle.cos()
+        thigh = self._thigh[:, None]
+        shank = self._shank[:, None]
+        knee_vx = self._flip * thigh * cos * rate
+        knee_vz = thigh * sin * rate
         shank_x, shank_z = shank_dir.unbind(-1)
         along = shank_x * knee_vx + shank_z * knee_vz
         det = shank_x[..., OUTER] * shank_z[..., INNER] - shank_z[..., OUTER] * shank_x[..., INNER]
@@ -213,7 +227,8 @@ class WholeBody:
         second = rotation @ self._second @ rotation.transpose(-1, -2)
         com = (mass * pos + first).sum(-2) / self.mass
         com_vel = (mass * vel + _cross(ang, first)).sum(-2) / self.mass
-        arm, moving = pos - com.unsqueeze(-2), vel - com_vel.unsqueeze(-2)
+        arm = pos - com.unsqueeze(-2)
+        moving = vel - com_vel.unsqueeze(-2)
         # second moments about the centre of mass
         outer = mass[..., None] * arm.unsqueeze(-1) * arm.unsqueeze(-2) + second
         mixed = arm.unsqueeze(-1) * first.unsqueeze(-2)
@@ -236,7 +251,8 @@ class WholeBody:
         angle = q[..., 7:].unflatten(-1, (4, 3))
         origins, ankle = self._planar(angle[..., 1:])[:2]
         local = torch.cat([torch.zeros_like(origins[..., :1, :]), origins, ankle.unsqueeze(-2)], dim=-2)
-        cos, sin = angle[..., 0].cos().unsqueeze(-1), (self._side * angle[..., 0].sin()).unsqueeze(-1)
+        cos = angle[..., 0].cos().unsqueeze(-1)
+        sin = (self._side * angle[..., 0].sin()).unsqueeze(-1)
         x, y, z = local.unbind(-1)
         hip = self._hip[:, None]
         inside = torch.stack([x + hip[..., 0], cos * y - sin * z + hip[..., 1], sin * y + cos * z + hip[..., 2]], -1)

@@ -7,12 +7,13 @@ import functools
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,23 +40,24 @@ def in_float32(value: float) -> str:
 
 def check_finite(name: str, *values: float) -> None:
     """Raise InputError if a value is NaN or infinite in float32."""
-    for value in values:
-        if not abs(value) <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite, got {in_float32(value)}")
+    _check_range(name, values, -FLOAT32_MAX, "finite")
 
 
 def check_positive(name: str, *values: float) -> None:
     """Raise InputError unless all values are positive and finite in float32."""
-    for value in values:
-        if not FLOAT32_MIN <= value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be positive and finite, got {in_float32(value)}")
+    _check_range(name, values, FLOAT32_MIN, "positive and finite")
 
 
 def check_not_negative(name: str, *values: float) -> None:
     """Raise InputError unless all values are non-negative and finite in float32."""
+    _check_range(name, values, 0.0, "finite and not negative")
+
+
+def _check_range(name: str, values: Iterable[float], low: float, expected: str) -> None:
+    """Raise InputError, which names the `expected` property, unless all values are from `low` to FLOAT32_MAX."""
     for value in values:
-        if not 0.0 <= value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite and not negative, got {in_float32(value)}")
+        if not low <= value <= FLOAT32_MAX:
+            raise InputError(f"{name} must be {expected}, got {in_float32(value)}")
 
 
 def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:
@@ -77,13 +79,17 @@ def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> int:
 
     Raises InputError: it is a bool, no integer, or not in 1 to `most`.
     """
-    try:
-        number = 0 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = 0
-    if not 1 <= number <= most:
+    if (number := _integer(value)) is None or not 1 <= number <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
     return number
+
+
+def _integer(value: Any) -> int | None:
+    """Return an integer of any type as int; None: it is a bool or no integer."""
+    try:
+        return None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        return None
 
 
 def check_flags(**flags: Any) -> None:
@@ -115,7 +121,7 @@ def check_types(section: str, cfg: Any) -> None:
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: type) -> Json:
     """Return the types of a dataclass's fields by name; empty if one of them cannot be evaluated."""
     try:
         return get_type_hints(kind)
@@ -125,7 +131,8 @@ def _hints(kind: type) -> dict[str, Any]:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value is of an annotated type."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
     if origin is tuple:
@@ -139,7 +146,8 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def _shown(hint: Any) -> str:
     """Return an annotated type as text for error messages, such as `(float, float)` or `(RewardTerm, ...)`."""
-    origin, parts = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    parts = get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(map(_shown, parts))
     if origin is tuple:
@@ -167,11 +175,7 @@ def check_seed(value: Any) -> int:
 
     Raises InputError: it is a bool, no integer, or not in 0 to MOST_SEED.
     """
-    try:
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = -1
-    if not 0 <= number <= MOST_SEED:
+    if (number := _integer(value)) is None or not 0 <= number <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
     return number
 

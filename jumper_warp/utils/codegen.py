@@ -49,16 +49,20 @@ def explained(types: Iterable[Any]) -> Iterator[None]:
 
 def _message(error: Exception, structs: Mapping[str, list[str]]) -> str | None:
     """Describe in a line why Warp cannot compile a function; None: another error. structs: field names by struct."""
-    found, owner, known = codegen_error(error), "", [name for fields in structs.values() for name in fields]
+    found = codegen_error(error)
+    owner = ""
+    known = [name for fields in structs.values() for name in fields]
     if found is None:
         if not (match := WRITTEN_IN_PYTHON.fullmatch(str(error))):
             return None
         frame = traceback.extract_tb(error.__traceback__)[-2]  # the last one is Warp's
-        place, field = f"{os.path.basename(frame.filename)}:{frame.lineno}, function {frame.name}", match[1]
+        place = f"{os.path.basename(frame.filename)}:{frame.lineno}, function {frame.name}"
+        field = match[1]
     else:
         place, cause = found
         if match := READ.search(cause):
-            field, owner = match[1], match[2] or ""
+            field = match[1]
+            owner = match[2] or ""
             known = structs.get(owner, [])
         elif isinstance(error, KeyError):  # an assignment
             field = cause

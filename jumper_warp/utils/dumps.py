@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jumper_warp.utils.arrays import read_npz
+from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import parse_json, write_atomically
+from jumper_warp.utils.files import Json, parse_json
 
 FORMAT, VERSION = "jumper-warp dump", 1
-GROUPS = ("rewards", "observations")  # Arrays of the values of all terms, whose names are in the header
-LABEL = re.compile(r"[\w. -]{1,250}")  # Names of tasks, terms and their components
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
@@ -44,32 +40,22 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
     """
     header |= {"format": FORMAT, "version": VERSION, "term": found.term, "value": str(found.value)}
     header |= {"world": found.world, "step": found.step, "names": found.names}
-    data = io.BytesIO()
-    arrays: dict[str, Any] = {"header": np.array(json.dumps(header, allow_nan=False)), **found.arrays}
-    np.savez_compressed(data, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data.getvalue())
+    write_npz(path, header=np.array(json.dumps(header, allow_nan=False)), **found.arrays)
 
 
-def load_dump(path: Path) -> tuple[NonFiniteValue, dict[str, Any]]:
+def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
     """Read a non-finite value and the header from a file that `write_dump` has written in a training.
 
-    Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, of another kind or version, or an
-    entry has another type or shape.
+    Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, or of another kind or version.
     """
     arrays = read_npz(path, "dump of a training")
     try:
         header = parse_json(str(arrays.pop("header")), "header")
-        names, entries = header["names"], [header["term"], header["task"]]
-        entries += [name for group in GROUPS for name in names[group]]
-        counts = [header["world"], header["step"], header["iteration"], header["config"]["train"]["seed"]]
-        shapes = {"joint_q": 43, "joint_qd": 38, "action": 12} | {name: len(names[name]) for name in GROUPS}
-        valid = header["format"] == FORMAT and header["version"] == VERSION
-        valid &= all(LABEL.fullmatch(entry) for entry in entries) and all(type(count) is int for count in counts)
-        valid &= all(values.dtype.kind in "biuf" for values in arrays.values())
-        if not valid or any(arrays[name].shape != (size,) for name, size in shapes.items()):
+        if (header["format"], header["version"]) != (FORMAT, VERSION):
             raise InputError(f"expected a {FORMAT} of version {VERSION}")
-        value, world, step = float(header["value"]), header["world"], header["step"]
-        return NonFiniteValue(header["term"], value, world, step, arrays, names), header
+        value = float(header["value"])
+        found = NonFiniteValue(header["term"], value, header["world"], header["step"], arrays, header["names"])
     except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error})") from error
+    return found, header

@@ -5,18 +5,35 @@ import math
 import os
 import stat
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
+Json = dict[str, Any]  # Object of JSON data, settings or values by name
 ErrorType = Callable[[str], InputError]
 MAX_BYTES = 256 * 2**20  # Size of the largest file that is read
 MAX_JSON_BYTES = 16 * 2**20  # Size of the largest JSON file that is read
-MAX_DEPTH = 50  # Levels of nested objects and lists in JSON
-MAX_DIGITS = 18  # Digits of an integer in JSON; all these are exact as int64
+
+
+@contextmanager
+def directory_lock(folder: Path) -> Iterator[int]:
+    """Hold the lock of a directory while files in it are replaced; waits until other processes and threads release it.
+
+    Yields the directory's descriptor. No file is written. There is no lock on network file systems that do not support
+    one. OSError: no such folder.
+    """
+    import fcntl  # absent on Windows, where files can still be read
+
+    directory = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(directory, fcntl.LOCK_EX)
+        yield directory
+    finally:
+        os.close(directory)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -26,41 +43,20 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     part = path.with_name(path.name + ".part")
     try:
-        with _open_alone(part) as file:
+        with directory_lock(path.parent) as directory:
             try:
-                file.truncate(0)  # the rest of a write that was killed
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
+                with part.open("wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
                 os.replace(part, path)
             except BaseException:
                 part.unlink(missing_ok=True)
                 raise
+            os.fsync(directory)
     except OSError as error:
         error.filename = str(path)
         raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def _open_alone(part: Path) -> BinaryIO:
-    """Open a file to append to it, and lock it against other processes and threads that write it, until it is closed.
-
-    Waits for those, which rename the file that they have opened.
-    """
-    import fcntl  # absent on Windows, where files can still be read
-
-    while True:
-        file = part.open("ab")
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX)
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
-                return file
-        file.close()
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
@@ -78,10 +74,8 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
         status = os.stat(path)
     except FileNotFoundError:
         raise error(f"{path}: no such file ({purpose})") from None
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
-    except ValueError:  # a null character
-        raise error(f"{path!s:.200}: is not a file name ({purpose})") from None
+    except (OSError, ValueError) as problem:  # ValueError: a null character
+        raise error(f"{path!s:.200}: cannot be read: {problem} ({purpose})") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder, not a file" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise error(f"{path}: {kind} ({purpose})")
@@ -92,15 +86,7 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
 
 def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
     """Return the bytes of a regular file; arguments and errors are those of `existing_file`."""
-    path = existing_file(path, purpose, limit, error)
-    try:
-        with path.open("rb") as file:
-            data = file.read(limit + 1)
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
-    if len(data) > limit:  # it has grown, or its size is unknown as in /proc
-        raise error(f"{path}: larger than {limit >> 20} MiB ({purpose})")
-    return data
+    return existing_file(path, purpose, limit, error).read_bytes()
 
 
 def read_json(
@@ -111,35 +97,22 @@ def read_json(
 
 
 def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, finite: bool = True) -> Any:
-    """Parse JSON data (UTF-8) with limits on depth and numbers, and return its content.
+    """Parse JSON data (UTF-8) and return its content.
 
     where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
-    not JSON, nests deeper than MAX_DEPTH, repeats a key, or has such a number or an integer of more than MAX_DIGITS
-    digits.
+    not JSON, nests too deeply, repeats a key, or has such a number.
     """
-    hooks: dict[str, Any] = {"parse_int": _integer}
-    if finite:
-        hooks |= {"parse_constant": _number, "parse_float": _number}
+    hooks: Json = {"parse_constant": _number, "parse_float": _number} if finite else {}
     try:
-        content = json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
-        if _depth(content, MAX_DEPTH) <= MAX_DEPTH:
-            json.dumps(content, ensure_ascii=False).encode()
-            return content
-        reason = f"more than {MAX_DEPTH} levels"
-    except RecursionError:
-        reason = f"more than {MAX_DEPTH} levels"
+        return json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
     except json.JSONDecodeError as problem:
         reason = f"line {problem.lineno}: {problem.msg}"
-    except UnicodeEncodeError:
-        reason = "a string has half of a surrogate pair"
-    except UnicodeDecodeError as problem:
-        reason = f"byte {problem.start} is not UTF-8"
-    except ValueError as problem:
+    except (ValueError, RecursionError) as problem:
         reason = str(problem)
     raise error(f"{where}: not JSON ({reason:.200})")
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, Any]]) -> Json:
     """Convert the (key, value) pairs of a JSON object to a dict. Raises InputError: a key occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):
@@ -153,18 +126,3 @@ def _number(text: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{text:.20} is not a finite number")
     return value
-
-
-def _integer(text: str) -> int:
-    """Convert the text of an integer in JSON to an int. Raises InputError: it has too many digits."""
-    if len(text.lstrip("-")) > MAX_DIGITS:
-        raise InputError(f"an integer of {len(text.lstrip('-'))} digits")
-    return int(text)
-
-
-def _depth(content: Any, limit: int) -> int:
-    """Return how deep lists and objects are nested in JSON data, at most limit + 1."""
-    parts = content.values() if isinstance(content, dict) else content if isinstance(content, list) else None
-    if parts is None or limit < 0:
-        return 0
-    return 1 + max((_depth(part, limit - 1) for part in parts), default=0)

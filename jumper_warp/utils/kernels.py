@@ -40,7 +40,9 @@ def content_hash(*parts: Any) -> bytes:
 
     A function has the same identity after a notebook's cell has defined a helper or a constant of it again.
     """
-    hasher, hashes, rest = ModuleHasher([], {}), [], list(parts)
+    hasher = ModuleHasher([], {})
+    hashes = []
+    rest = list(parts)
     while rest:
         part = rest.pop()
         if isinstance(part, tuple):

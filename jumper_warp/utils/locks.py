@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -32,20 +31,3 @@ def write_lock(folder: Path, file: Path | None = None) -> Iterator[None]:
         if file is not None:
             file.unlink(missing_ok=True)
         lock.release()
-
-
-@contextmanager
-def directory_lock(folder: Path) -> Iterator[None]:
-    """Hold the lock of a directory while files in it are replaced; waits until other processes and threads release it.
-
-    No file is written. There is no lock on network file systems that do not support one. OSError: no such folder.
-    """
-    import fcntl  # absent on Windows
-
-    directory = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            fcntl.flock(directory, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(directory)

@@ -94,12 +94,15 @@ def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
 def rate(values: ArrayLike, over: str = "") -> MetricValue:
     """Return the fraction of true values (n,) as a metric with Wilson's 95 % interval; over: the trials, as text."""
     values = np.asarray(values, dtype=bool)
-    n, p = values.size, float(values.mean()) if values.size else None
+    n = values.size
+    p = float(values.mean()) if values.size else None
     if p is None:
         return MetricValue(None, 0, None, over)
     scale = 1.0 + Z * Z / n
-    center, half = p + 0.5 * Z * Z / n, Z * np.sqrt(p * (1.0 - p) / n + (0.5 * Z / n) ** 2)
-    low, high = (center - half) / scale, (center + half) / scale
+    center = p + 0.5 * Z * Z / n
+    half = Z * np.sqrt(p * (1.0 - p) / n + (0.5 * Z / n) ** 2)
+    low = (center - half) / scale
+    high = (center + half) / scale
     return MetricValue(p, n, (max(float(low), 0.0), min(float(high), 1.0)), over)
 
 
@@ -126,7 +129,8 @@ def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda 
     rows = rows[rows[:, 1] > 0]
     if not len(rows):
         return MetricValue(None, 0, None, over)
-    total, means = rows.sum(axis=0), resampled_means(rows)
+    total = rows.sum(axis=0)
+    means = resampled_means(rows)
     low, high = np.quantile(function(means[:, 0] / means[:, 1]), (0.025, 0.975))
     return MetricValue(float(function(total[0] / total[1])), len(rows), (float(low), float(high)), over)
 
@@ -140,18 +144,22 @@ def largest(values: ArrayLike, over: str = "") -> MetricValue:
 
 def resampled_means(rows: np.ndarray) -> np.ndarray:
     """Return the column means (RESAMPLES, columns) of bootstrap samples that are drawn from rows (n, columns)."""
-    rng, n = np.random.default_rng(BOOTSTRAP_SEED), len(rows)
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    n = len(rows)
     at_once = max(1, min(RESAMPLES, BATCH // n))
     sizes = [min(at_once, RESAMPLES - done) for done in range(0, RESAMPLES, at_once)]
     return np.concatenate([rows[rng.integers(0, n, (size, n))].mean(axis=1) for size in sizes])
 
 
 def print_metrics(
-    metrics: AnyMetrics, paper: Mapping[str, float] | None = None, conditions: Mapping[str, Any] | None = None,
+    metrics: AnyMetrics,
+    paper: Mapping[str, float] | None = None,
+    conditions: Mapping[str, Any] | None = None,
     title: str = "",
-) -> None:  # fmt: skip
+) -> None:
     """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line."""
-    conditions, lists = conditions or {}, {}
+    conditions = conditions or {}
+    lists = {}
     table = Table(
         Column("metric", overflow="fold"),
         "value",

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, read_json, write_atomically
-from jumper_warp.utils.metrics import AnyMetrics, MetricValue, Scalar, unit_of
+from jumper_warp.utils.files import Json, json_bytes, read_json, write_atomically
+from jumper_warp.utils.metrics import AnyMetrics, MetricValue, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
 VERSION = 1  # Version of the layout of metrics.json
@@ -21,15 +21,15 @@ class Report(NamedTuple):
     """Metrics of a run with the conditions in which they were measured, and the file that holds both."""
 
     path: Path  # of metrics.json
-    conditions: dict[str, Any]  # conditions of the evaluation by name
+    conditions: Json  # conditions of the evaluation by name
     metrics: dict[str, MetricValue]  # values are Python numbers, strings, None, or lists of these
 
     @property
-    def values(self) -> dict[str, Any]:
+    def values(self) -> Json:
         """Conditions, and values of the metrics without intervals, by name."""
         return self.conditions | {key: metric.value for key, metric in self.metrics.items()}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the content of metrics.json."""
         entries = {
             key: {"value": metric.value, "unit": unit_of(key)} | metric._asdict()
@@ -52,7 +52,8 @@ def output_dir(name: str, out: Path | None = None) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder, repeat = Path("outputs", name, stamp), 1
+    folder = Path("outputs", name, stamp)
+    repeat = 1
     while True:
         try:
             folder.mkdir(parents=True)
@@ -67,10 +68,14 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 
     Each file is written atomically. Environment variables are not saved. NumPy
     scalars become Python numbers. folder: an existing folder; conditions: conditions of the evaluation by name. Raises
-    InputError: a value is not finite. TypeError: a value has another type. Both name the metric.
+    InputError: a value is not finite. TypeError: JSON cannot hold it.
     """
-    known = {name: _to_python(name, value) for name, value in (conditions or {}).items()}
-    converted = {key: _converted(key, value) for key, value in metrics.items()}
+    known = {name: _plain(name, value) for name, value in (conditions or {}).items()}
+    converted = {}
+    for key, value in metrics.items():
+        metric = value if isinstance(value, MetricValue) else MetricValue(value)
+        interval = metric.interval and _plain(key, list(metric.interval))
+        converted[key] = metric._replace(value=_plain(key, metric.value), interval=interval)
     report = Report(folder / "metrics.json", known, converted)
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     run = source_versions() | {"device": device_info()._asdict(), "command": command}
@@ -79,45 +84,24 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
     return report
 
 
-def read_report(folder: Path) -> Report:
-    """Read the metrics and conditions of a run from its `metrics.json`. Raises InputError: it is missing or damaged."""
+def read_values(folder: Path) -> Json:
+    """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name.
+
+    Raises InputError: the file is missing or damaged.
+    """
     path = folder / "metrics.json"
     document = read_json(path, "metrics of an evaluation")
     try:
-        entries = document["metrics"].items()
-        metrics = {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries}
-        return Report(path, document["conditions"], metrics)
+        return document["conditions"] | {key: entry["value"] for key, entry in document["metrics"].items()}
     except (LookupError, TypeError, AttributeError):
         raise InputError(f"{path}: not the metrics of an evaluation") from None
 
 
-def read_values(folder: Path) -> dict[str, Any]:
-    """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
-    return read_report(folder).values
-
-
-def _converted(key: str, value: Any) -> MetricValue:
-    """Return a metric with Python numbers and lists. Raises TypeError or InputError as `write_metrics`."""
-    metric = value if isinstance(value, MetricValue) else MetricValue(value)
-    interval: Any = None if metric.interval is None else _to_python(key, list(metric.interval))
-    return metric._replace(value=_to_python(key, metric.value), interval=interval)
-
-
-def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:
-    """Convert a metric's value to a Python scalar or list. Raises TypeError or InputError as `write_metrics`."""
-    if not isinstance(name, str):
-        raise TypeError(f"the name of a metric must be a string, got {name!r}")
+def _plain(name: str, value: Any) -> Any:
+    """Convert a scalar, or each item of a list, to a Python object. Raises InputError: a number is not finite."""
     if isinstance(value, list):
-        return [_to_python_scalar(f"{name}[{index}]", item) for index, item in enumerate(value)]
-    return _to_python_scalar(name, value)
-
-
-def _to_python_scalar(name: str, value: Any) -> Scalar:
-    """Convert a scalar of a metric to a Python object. Raises TypeError or InputError: another type, or not finite."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if not isinstance(value, Scalar):
-        raise TypeError(f"metric {name!r} must be a number, string or None, or a flat list, got {type(value).__name__}")
+        return [_plain(f"{name}[{index}]", item) for index, item in enumerate(value)]
+    value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"metric {name!r} is {value}: only finite numbers are reported")
     return value

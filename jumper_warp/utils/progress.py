@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial, wraps
-from typing import ParamSpec, TypeVar
+from functools import partial
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from jumper_warp.utils.startup import open_standard_streams
 
-P = ParamSpec("P")
-T = TypeVar("T")
 _shown: Progress | None = None  # Display of the outermost phase, which shows the phases within it too
 
 
@@ -27,15 +22,6 @@ def format_duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60.0), 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
-
-
-class _TimeLeft(ProgressColumn):
-    """Column of the progress display with the estimated time left; empty if it is unknown."""
-
-    def render(self, task: Task) -> Text:
-        """Return the estimated time left of a task as text."""
-        seconds = task.time_remaining
-        return Text("" if seconds is None else f"{format_duration(seconds)} left")
 
 
 @contextmanager
@@ -52,11 +38,12 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         return
     progress, outer = _shown, _shown
     if progress is None:
-        columns = ("{task.description}", BarColumn(20), TimeElapsedColumn(), _TimeLeft())
+        columns = ("{task.description}", BarColumn(20), TimeElapsedColumn(), TimeRemainingColumn())
         # prints to another file than the terminal must not be redirected to it
         progress = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
         progress.start()
-    _shown, task = progress, progress.add_task(title, total=total)
+    _shown = progress
+    task = progress.add_task(title, total=total)
     try:
         yield partial(progress.advance, task)
     finally:
@@ -64,16 +51,3 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         _shown = outer
         if outer is None:
             progress.stop()
-
-
-def shown(title: str, function: Callable[P, T]) -> Callable[P, T]:
-    """Return a version of a function that displays `title` while it runs in the main thread outside a `phase`."""
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if _shown is not None or threading.current_thread() is not threading.main_thread():
-            return function(*args, **kwargs)
-        with phase(title):
-            return function(*args, **kwargs)
-
-    return call

@@ -10,7 +10,8 @@ CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) rotated by quaternions xyzw (..., 4)."""
-    axis, w = quaternion[..., :3], quaternion[..., 3:]
+    axis = quaternion[..., :3]
+    w = quaternion[..., 3:]
     return vector + 2.0 * np.cross(axis, np.cross(axis, vector) + w * vector)
 
 
@@ -43,5 +44,7 @@ def yaw_of(quaternion: np.ndarray) -> np.ndarray:
 
 def turn_plane(vector: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return vectors x, y (..., 2) turned by angles [rad], (...), about z."""
-    (x, y), cos, sin = np.moveaxis(vector, -1, 0), np.cos(angle), np.sin(angle)
+    (x, y) = np.moveaxis(vector, -1, 0)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -29,7 +30,8 @@ def module_from_file(name: str, path: str | Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ImportError(f"{Path(path).name}: the name of a module's file must end in .py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name], folder = module, str(Path(path).resolve().parent)
+    sys.modules[name] = module
+    folder = str(Path(path).resolve().parent)
     sys.path.insert(0, folder)
     try:
         spec.loader.exec_module(module)
@@ -50,7 +52,8 @@ def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
     folders = {os.path.dirname(file) for file in files if os.path.basename(os.path.dirname(file)) != "site-packages"}
     near = []
     for name, module in list(sys.modules.items()):
-        file, path = getattr(module, "__file__", None), name.replace(".", os.sep)
+        file = getattr(module, "__file__", None)
+        path = name.replace(".", os.sep)
         if file not in files and any(file in (f"{f}/{path}.py", f"{f}/{path}/__init__.py") for f in folders):
             near.append(module)
     return [*modules, *near]
@@ -72,7 +75,7 @@ def source_checksums(saved: Any) -> dict[str, str]:
     task as JSON. Modules that are not loaded or have no file are left out.
     """
     checksums = {}
-    for module in sorted(set(_modules(saved))):
+    for module in sorted(set(re.findall(r'"([\w.]+):', json.dumps(saved, ensure_ascii=False)))):
         file = getattr(sys.modules.get(module), "__file__", None)
         if file and not module.startswith(PROJECT_PREFIX) and Path(file).is_file():
             checksums[module] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
@@ -90,14 +93,3 @@ def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
         for module, checksum in new.items()
         if saved.get(module, checksum) != checksum
     ]
-
-
-def _modules(saved: Any) -> Iterator[str]:
-    """Yield the names of modules in saved data: the part before the colon of each string with a colon."""
-    if isinstance(saved, str):
-        module, colon, _ = saved.partition(":")
-        if colon:
-            yield module
-    elif isinstance(saved, dict | list):
-        for part in saved.values() if isinstance(saved, dict) else saved:
-            yield from _modules(part)

@@ -16,7 +16,8 @@ def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
     if not isinstance(value, dict):
         raise InputError(f"{where} must be a dictionary, got {type(value).__name__}")
     names = set(names)
-    missing, unknown = sorted(map(str, names - value.keys())), sorted(map(str, value.keys() - names))
+    missing = sorted(map(str, names - value.keys()))
+    unknown = sorted(map(str, value.keys() - names))
     if missing or unknown:
         raise InputError(f"{where}: missing entries: {_listed(missing)}; unexpected entries: {_listed(unknown)}")
 

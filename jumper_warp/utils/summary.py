@@ -35,20 +35,29 @@ class PrintFlags:
 
 
 def print_summary(
-    report: Report, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
-    flags: PrintFlags | None = None, trial: str = "trial", films: Iterable[Path] = (),
-) -> None:  # fmt: skip
+    report: Report,
+    title: str,
+    keys: Iterable[str],
+    *,
+    seconds: float,
+    paper: Mapping[str, float] | None = None,
+    flags: PrintFlags | None = None,
+    trial: str = "trial",
+    films: Iterable[Path] = (),
+) -> None:
     """Print a summary of a run: title, main metrics (by `keys`) and paths of its files, 80 columns wide.
 
     title: what was done; keys: of the main metrics, those that the report lacks are skipped; seconds: wall time of the
     run; paper: published values by key; flags: print all metrics, or the file itself; trial: noun for the items of
     metrics that are lists; films: films of the run, in any folder.
     """
-    flags, paper = flags or PrintFlags(), paper or {}
+    flags = flags or PrintFlags()
+    paper = paper or {}
     if flags.json:
         print(json_bytes(report.to_json()).decode(), end="")
         return
-    metrics, folder = report.metrics, report.path.parent
+    metrics = report.metrics
+    folder = report.path.parent
     main = {key: metrics[key] for key in keys if key in metrics}
     print(textwrap.fill(title, WIDTH))
     if flags.verbose:
@@ -64,7 +73,8 @@ def print_summary(
 
 def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
     """Return a printable table of metrics in words, with units, beside the paper's values if there are any."""
-    intervals, published = any(metric.interval for metric in metrics.values()), bool(paper.keys() & metrics.keys())
+    intervals = any(metric.interval for metric in metrics.values())
+    published = bool(paper.keys() & metrics.keys())
     columns = [Column("", overflow="fold"), "value", *["95 % interval"] * intervals, *["paper"] * published]
     table = Table(*columns, box=None, pad_edge=False)
     for key, metric in metrics.items():

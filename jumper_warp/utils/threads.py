@@ -35,7 +35,9 @@ class WarpLock:
 
     def __init__(self) -> None:
         """Create the lock, and let forks of this process wait until no thread holds it."""
-        self._lock, self._used, self._forked = RLock(), False, False
+        self._lock = RLock()
+        self._used = False
+        self._forked = False
         release = self._lock.release
         os.register_at_fork(before=self._lock.acquire, after_in_parent=release, after_in_child=self._after_fork)
 
@@ -136,7 +138,8 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     """
     jobs = list(jobs)
     workers = min(threads, len(jobs)) - 1
-    remaining, errors = iter(jobs), SimpleQueue()
+    remaining = iter(jobs)
+    errors = SimpleQueue()
 
     def work() -> None:
         """Run jobs until none remains; put the exception that one of them raised, or None, into `errors`."""

@@ -10,13 +10,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
@@ -60,7 +59,8 @@ def write_film(
     right, at the least distance that shows all). ranks: indices in `recording.worlds`, shown side by side (default:
     all). Raises InputError: see `check_film`, or too many frames for the format; OSError.
     """
-    path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    path = Path(path)
+    size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
     check_film(path, size, fps, speed, eye)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
@@ -96,18 +96,24 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye:
 
 
 def _images(
-    recording: Recording, times: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None, ranks: Sequence[int],
+    recording: Recording,
+    times: np.ndarray,
+    size: tuple[int, int],
+    eye: Sequence[float] | None,
+    ranks: Sequence[int],
     name: str,
-) -> Iterator[Image.Image]:  # fmt: skip
+) -> Iterator[Image.Image]:
     """Yield the annotated images of a film at `times` [s], with a progress bar; name: label of the bar."""
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
-    poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
+    poses = drawn_poses(recording, times)
+    paths = body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
     seen = paths - targets[:, None]
     if len(recording.commands) or not recording.contact_forces.any():  # arrows; raised legs of a floating robot
         seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
     frame_view = _view(seen, size, eye)
-    targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
+    targets = _interpolated(recording, targets, times)
+    bases = _interpolated(recording, paths, times)
     with (
         open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer,
         phase(f"drawing {name} with {renderer.name}", len(times)) as advance,
@@ -143,7 +149,8 @@ def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
     before = np.maximum(after - 1, 0)
     span = np.maximum(recording.times[after] - recording.times[before], 1.0e-9)
     weight = np.clip((times - recording.times[before]) / span, 0.0, 1.0)[:, None, None]
-    start, end = recording.poses[before].astype(float), recording.poses[after].astype(float)
+    start = recording.poses[before].astype(float)
+    end = recording.poses[after].astype(float)
     sign = np.where((start[..., 3:] * end[..., 3:]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
     end[..., 3:] *= sign
     poses = start + weight * (end - start)
@@ -189,9 +196,7 @@ def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
     return "   ".join(filter(None, [recording.heading(ranks), f"{time:.2f} s"]))
 
 
-def _encode_mp4(
-    path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float
-) -> None:  # fmt: skip
+def _encode_mp4(path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float) -> None:
     """Write images as H.264 in yuv420p, for browsers and slides. Raises OSError, about `target`: ffmpeg fails."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -211,10 +216,11 @@ def _encode_mp4(
 
 def _encoded_animation(images: Iterator[Image.Image], kind: str, fps: float, count: int) -> bytes:
     """Return `count` images as the content of a file with a repeating animation; kind: webp or gif."""
-    pictures, data = list(images), io.BytesIO()
+    pictures = list(images)
+    data = io.BytesIO()
     tick = 10 if kind == "gif" else 1  # [ms] unit of the durations in the file
     ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)
     durations = np.diff(ends).tolist()  # [ms]
-    options: dict[str, Any] = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
+    options: Json = {"quality": 75, "method": 4} if kind == "webp" else {"optimize": True}
     pictures[0].save(data, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)
     return data.getvalue()

@@ -200,9 +200,14 @@ def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def write_picture(
-    recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, eye: Sequence[float] | None = None,
+    recording: Recording,
+    path: Path,
+    *,
+    rank: int = 0,
+    width: int = WIDTH,
+    eye: Sequence[float] | None = None,
     title: str | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a composite picture (.png, .webp or .jpg) of one world of a recording; return its path.
 
     rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. eye: direction of
@@ -241,7 +246,8 @@ def _opacity(scene: Composition) -> np.ndarray:
     """
     places = np.stack([scene.bases @ scene.right, scene.bases[:, 2]], axis=1)
     apexes = [first + int(np.argmax(scene.base[first : last + 1, 2])) for first, last in scene.flights]
-    first, last = scene.frames[0], scene.frames[-1]
+    first = scene.frames[0]
+    last = scene.frames[-1]
     rank = [0 if frame in apexes else 1 if frame in (first, last) else 2 for frame in scene.frames]
     opacity = np.full(len(places), GHOST)
     for i in sorted(range(len(places)), key=lambda i: rank[i]):
@@ -290,7 +296,8 @@ def _shapes(scene: Composition) -> list[ShapeMesh]:
 def _lines(scene: Composition) -> list[Line]:
     """Return the lines to draw: path of the base or axis of moments, bars at commanded heights, scale of height."""
     low, high = scene.span()
-    first, last = scene.frames[0], scene.frames[-1]
+    first = scene.frames[0]
+    last = scene.frames[-1]
     if scene.stays:
         axis = [[(low, 0.0), (high, 0.0)]]  # no arrow: it would suggest an even scale
         axis += [[(along, 0.03), (along, 0.0)] for along in scene.bases @ scene.right]
@@ -323,11 +330,13 @@ def _labels(scene: Composition) -> list[Label]:
     Times are above the robots, or on the axis of a robot that stays in place.
     """
     low, high = scene.span()
-    jumps, labels = bool(scene.flights), []
+    jumps = bool(scene.flights)
+    labels = []
     for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):
         if opacity < 1.0:
             continue
-        time, height = f"{scene.recording.times[frame]:.2f} s", [f"{base[2]:.2f} m"] if jumps else []
+        time = f"{scene.recording.times[frame]:.2f} s"
+        height = [f"{base[2]:.2f} m"] if jumps else []
         above = height if scene.stays else [time, *height]
         place = base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]
         if any(place[2] - 0.03 < bar < place[2] + TEXT * len(above) for bar in scene.heights):

@@ -62,10 +62,20 @@ class Published:
 
 
 def plot_sweep(
-    path: Path, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, *, tolerance: float, paper: Published,
-    limit: np.ndarray | None = None, trained: Mapping[str, Sequence[float]] | None = None,
-    labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
-) -> None:  # fmt: skip
+    path: Path,
+    commanded: np.ndarray,
+    reached: np.ndarray,
+    good: np.ndarray,
+    *,
+    tolerance: float,
+    paper: Published,
+    limit: np.ndarray | None = None,
+    trained: Mapping[str, Sequence[float]] | None = None,
+    labels: tuple[str, str],
+    marks: tuple[str, str],
+    title: str,
+    conditions: str,
+) -> None:
     """Plot reached over commanded values of a sweep, and below them the errors with their running mean.
 
     Errors beyond the range of the lower axes are marked at its edge.
@@ -74,8 +84,10 @@ def plot_sweep(
     apexes of open-loop jumps of the same robots, (jumps,); trained [m]: ranges of commands by label; labels: of the
     axes above; marks: labels of good and of other jumps.
     """
-    error, pad = reached - commanded, max(0.05 * np.ptp(commanded), 0.02)
-    low, high = commanded.min() - pad, commanded.max() + pad
+    error = reached - commanded
+    pad = max(0.05 * np.ptp(commanded), 0.02)
+    low = commanded.min() - pad
+    high = commanded.max() + pad
     bottom, top = np.clip(
         [np.nanmin([*(reached - pad), low]), np.nanmax([*(reached + pad), high])], 2 * low - high, 2 * high - low
     )
@@ -85,7 +97,8 @@ def plot_sweep(
     with figure(
         path, 2, 1, sharex=True, height_ratios=ratios, figsize=size, title=title, conditions=conditions
     ) as axes:
-        line, none = np.array([low, high]), np.zeros(2)
+        line = np.array([low, high])
+        none = np.zeros(2)
         for axis, y, ideal in zip(axes, (reached, np.clip(error, -edge, edge)), (line, none), strict=True):
             axis.fill_between(line, ideal - tolerance, ideal + tolerance, **BAND, label=f"within {tolerance:g} m")
             axis.plot(line, ideal, color="C2", linewidth=1.0, label="commanded")
@@ -134,9 +147,14 @@ def plot_running_mean(axis: Any, commanded: np.ndarray, error: np.ndarray) -> No
 
 
 def plot_landings(
-    path: Path, tests: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], *, tolerance: float, title: str,
-    conditions: str, outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
-) -> None:  # fmt: skip
+    path: Path,
+    tests: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    *,
+    tolerance: float,
+    title: str,
+    conditions: str,
+    outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
+) -> None:
     """Plot goals and landing positions from above, relative to the start, one panel per test.
 
     tests: by title of the panel, goals [m] and landing positions [m], (jumps, 2), and success (jumps,); tolerance [m]:
@@ -146,8 +164,10 @@ def plot_landings(
     from matplotlib.collections import PolyCollection
 
     points = np.concatenate([np.nan_to_num(np.concatenate(values[:2])) for values in tests.values()])
-    (x0, y0), (x1, y1) = np.minimum(points.min(axis=0), 0.0), np.maximum(points.max(axis=0), 0.0)
-    margin, width = (3.0 if outlines else 1.5) * tolerance, max(7.0, 4.5 * len(tests))
+    (x0, y0) = np.minimum(points.min(axis=0), 0.0)
+    (x1, y1) = np.maximum(points.max(axis=0), 0.0)
+    margin = (3.0 if outlines else 1.5) * tolerance
+    width = max(7.0, 4.5 * len(tests))
     size = (width, (width - 0.9) / len(tests) * (y1 - y0 + 2 * margin) / (x1 - x0 + 2 * margin) + 1.8)
     with figure(
         path, 1, len(tests), sharex=True, sharey=True, squeeze=False, figsize=size, title=title, conditions=conditions
@@ -176,9 +196,15 @@ def regular_polygons(centers: np.ndarray, radius: float, corners: int = 48) -> n
 
 
 def plot_distances(
-    path: Path, distances: Sequence[float], successes: Mapping[str, np.ndarray], errors: np.ndarray, *,
-    reliable: float, published: Mapping[str, float], conditions: str,
-) -> None:  # fmt: skip
+    path: Path,
+    distances: Sequence[float],
+    successes: Mapping[str, np.ndarray],
+    errors: np.ndarray,
+    *,
+    reliable: float,
+    published: Mapping[str, float],
+    conditions: str,
+) -> None:
     """Plot success rates and mean errors of bins of distances, with their 95 % intervals.
 
     distances [m]: middles of the bins; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;
@@ -228,6 +254,7 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Seq
 def path_limits(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y limits [m] of a plot of paths [m], (paths, steps, 2); the y range is at least x range / 5."""
     low, high = (limit(paths, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
-    middle, size = 0.5 * (low + high), np.maximum(1.1 * (high - low), 0.2)
+    middle = 0.5 * (low + high)
+    size = np.maximum(1.1 * (high - low), 0.2)
     size[1] = max(size[1], 0.2 * size[0])
     return middle[0] + size[0] * np.array([-0.5, 0.5]), middle[1] + size[1] * np.array([-0.5, 0.5])

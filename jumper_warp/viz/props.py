@@ -32,7 +32,8 @@ def goal_shapes(recording: Recording) -> list[ShapeMesh]:
             shapes.append((f"goal_{rank}_{number}", rank, ring, place))
     for rank, height in enumerate(recording.heights):
         x, y = recording.body_poses(rank)[0, 0, :2]
-        bar, place = trimesh.creation.box(extents=BAR_SIZE), np.array([x, y + BAR_OFFSET, height])
+        bar = trimesh.creation.box(extents=BAR_SIZE)
+        place = np.array([x, y + BAR_OFFSET, height])
         shapes.append((f"height_{rank}", rank, bar, place))
     return [
         _shape(name, -1, GOAL_COLOR, mesh.apply_translation(place + (0.0, rank * recording.spacing, 0.0)))
@@ -46,16 +47,20 @@ def _surface_height(recording: Recording, rank: int, point: np.ndarray) -> float
 
     The highest surface counts.
     """
-    block, heights = f"world_{recording.worlds[rank]}/block", []
+    block = f"world_{recording.worlds[rank]}/block"
+    heights = []
     for shape in recording.shapes:
         if shape.body >= 0 and recording.bodies[shape.body] != block:
             continue
         origin = recording.poses[-1, shape.body, :3] if shape.body >= 0 else np.zeros(3)
         a, b, c = np.moveaxis((shape.vertices + origin)[shape.triangles].astype(float), 1, 0)
-        ab, ac, offset = b - a, c - a, point - a
+        ab = b - a
+        ac = c - a
+        offset = point - a
         with np.errstate(divide="ignore", invalid="ignore"):  # a vertical triangle has no area seen from above
             area = _cross(ab, ac)
-            u, v = _cross(offset, ac) / area, _cross(ab, offset) / area
+            u = _cross(offset, ac) / area
+            v = _cross(ab, offset) / area
             inside = (u > -1.0e-6) & (v > -1.0e-6) & (u + v < 1.0 + 1.0e-6)
             heights.extend((a[:, 2] + u * ab[:, 2] + v * ac[:, 2])[inside])
     return float(max(heights, default=point[2]))
@@ -72,7 +77,9 @@ def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, hei
     centers: x and y [m], world frame, (frames, recorded worlds, 2). half: half extents along x and y [m], (recorded
     worlds, 2). height: [m], (recorded worlds,).
     """
-    poses, names, shapes = [recording.poses], list(recording.bodies), list(recording.shapes)
+    poses = [recording.poses]
+    names = list(recording.bodies)
+    shapes = list(recording.shapes)
     for rank, world in enumerate(recording.worlds):
         pose = np.zeros((len(recording.times), 1, 7), dtype=np.float32)
         pose[:, 0, :2] = centers[:, rank]

@@ -53,7 +53,8 @@ class Recorder:
             ShapeMesh(s.name, index[s.body], s.color, s.vertices, s.normals, s.triangles)
             for s in shape_meshes(model, self._worlds)
         )
-        self._notes, self._labels = dict(notes or {}), tuple(labels)
+        self._notes = dict(notes or {})
+        self._labels = tuple(labels)
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
         self._series: dict[str, list[float]] | None = None

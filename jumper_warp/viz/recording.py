@@ -15,7 +15,7 @@ import numpy as np
 
 from jumper_warp.utils.arrays import read_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import parse_json, write_atomically
+from jumper_warp.utils.files import Json, parse_json, write_atomically
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
@@ -53,7 +53,7 @@ class Recording:
     """Contact force on the robot [N], world frame, (num_frames, num_worlds, contacts_per_world, 3) float32."""
     spacing: float = 0.0  # [m] Distance along y between the drawings of consecutive worlds; the data are not moved
     shapes: tuple[ShapeMesh, ...] = ()  # meshes to draw; their `body` is an index of `bodies`, -1 for the world
-    notes: dict[str, Any] = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
+    notes: Json = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
     labels: tuple[str, ...] = ()  # names of the worlds to show, such as their goals; default `world_<i>`
     states: dict[str, list[str]] = field(default_factory=dict)  # by name, a text for each frame, such as a phase
     goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
@@ -130,7 +130,7 @@ def load_npz(path: Path) -> Recording:
         raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
 
 
-def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
+def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
     """Build a recording from a NumPy archive; header: its decoded JSON entry `header`."""
     shapes = tuple(
         ShapeMesh(
@@ -162,10 +162,14 @@ def _check_arrays(recording: Recording) -> None:
     frames, worlds, bodies = (len(part) for part in (recording.times, recording.worlds, recording.bodies))
     contacts, goals = recording.contact_points.shape[2:3], recording.goals.shape[1:2]
     for name, *shapes in (
-        ("times", (frames,)), ("poses", (frames, bodies, 7)), ("contact_points", (frames, worlds, *contacts, 3)),
-        ("contact_forces", (frames, worlds, *contacts, 3)), ("goals", (worlds, *goals, 3), (0, *goals, 3)),
-        ("heights", (worlds,), (0,)), ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
-    ):  # fmt: skip
+        ("times", (frames,)),
+        ("poses", (frames, bodies, 7)),
+        ("contact_points", (frames, worlds, *contacts, 3)),
+        ("contact_forces", (frames, worlds, *contacts, 3)),
+        ("goals", (worlds, *goals, 3), (0, *goals, 3)),
+        ("heights", (worlds,), (0,)),
+        ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
+    ):
         values = getattr(recording, name)
         _check(name, values.dtype.kind in "fiu" and values.shape in shapes)
     for values in recording.series.values():
@@ -187,7 +191,8 @@ def _check_arrays(recording: Recording) -> None:
 
 def _check_names(recording: Recording) -> None:
     """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies."""
-    worlds, frames = recording.worlds, len(recording.times)
+    worlds = recording.worlds
+    frames = len(recording.times)
     _check("worlds", worlds and all(type(world) is int and world >= 0 for world in worlds))
     _check("worlds", len(set(worlds)) == len(worlds))
     _check("bodies", all(re.fullmatch(r"world_\d+/.+", body) for body in recording.bodies))

@@ -52,7 +52,8 @@ class View:
         if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
             eye, target = (tuple(np.asarray(point, dtype=float).tolist()) for point in (self.eye, self.target))
             raise InputError(f"the view from {eye} to {target} is vertical")
-        ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
+        ahead = ahead / np.linalg.norm(ahead)
+        right = right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, ahead), ahead])
 
     def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -143,10 +144,14 @@ class GLRenderer(Renderer):
         viewer = self._viewer
         viewer.show_joints = viewer.show_com = False
         renderer = viewer.renderer
-        renderer.spotlight_enabled, renderer.sky_upper, renderer.sky_lower = False, SKY, HORIZON
-        renderer._sun_direction, renderer.exposure = np.array(SUN) / np.linalg.norm(SUN), EXPOSURE
+        renderer.spotlight_enabled = False
+        renderer.sky_upper = SKY
+        renderer.sky_lower = HORIZON
+        renderer._sun_direction = np.array(SUN) / np.linalg.norm(SUN)
+        renderer.exposure = EXPOSURE
         renderer.shadow_extents = SHADOW_EXTENT
-        renderer.line_width, renderer.arrow_scale = LINE_WIDTH * size[0], 0.6 * LINE_WIDTH * size[0]
+        renderer.line_width = LINE_WIDTH * size[0]
+        renderer.arrow_scale = 0.6 * LINE_WIDTH * size[0]
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
         """Load the bodies to draw into OpenGL's viewer; arguments: see `Renderer.load`."""
@@ -155,7 +160,8 @@ class GLRenderer(Renderer):
         self._viewer.set_model(self.model)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
-        viewer, camera = self._viewer, self._viewer.camera
+        viewer = self._viewer
+        camera = self._viewer.camera
         viewer.renderer._make_current()  # another window may have drawn since
         camera.fov = view.field_of_view
         camera.pos = camera._as_vec3(view.eye)
@@ -169,7 +175,8 @@ class GLRenderer(Renderer):
 
     def close(self) -> None:
         """Free the bodies, and store the window for the next renderer."""
-        viewer, self._viewer = self._viewer, None
+        viewer = self._viewer
+        self._viewer = None
         if viewer is not None:
             viewer.renderer._make_current()
             viewer.set_model(None)

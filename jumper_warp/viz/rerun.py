@@ -54,7 +54,8 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
     """
     rr = _import_rerun()
     stream = rr.RecordingStream("jumper-warp")
-    memory, writer = stream.memory_recording(), _Writer(rr, stream, recording)
+    memory = stream.memory_recording()
+    writer = _Writer(rr, stream, recording)
     stream.send_blueprint(_blueprint(recording), make_active=False, make_default=True)
     writer.log_scene()
     for rank in range(len(recording.worlds)):
@@ -79,7 +80,9 @@ class _Writer:
 
     def __init__(self, rr: ModuleType, stream: Any, recording: "Recording") -> None:
         """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`."""
-        self.rr, self.stream, self.recording = rr, stream, recording
+        self.rr = rr
+        self.stream = stream
+        self.recording = recording
         self.worlds = _world_names(recording)
         self.times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
 
@@ -106,10 +109,13 @@ class _Writer:
 
     def log_world(self, rank: int) -> None:
         """Log position, trail, contact forces and velocities of the rank-th recorded world."""
-        rr, recording, parent = self.rr, self.recording, ["scene", self.worlds[rank]]
+        rr = self.rr
+        recording = self.recording
+        parent = ["scene", self.worlds[rank]]
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
         self.stream.log(rr.new_entity_path(parent), offset, static=True)
-        points, base = recording.contact_points[:, rank], recording.body_poses(rank)[:, 0]
+        points = recording.contact_points[:, rank]
+        base = recording.body_poses(rank)[:, 0]
         colors = list(LEG_COLORS.values())  # four contact points are the paws
         colors = colors if points.shape[1] == len(colors) else [ACTUAL_COLOR] * points.shape[1]
         strips = [base[:, :3], *points.transpose(1, 0, 2)]
@@ -205,7 +211,8 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
     base[..., 1] += recording.spacing * np.arange(count)
     base = np.where(np.isfinite(base), base, 0.0)
     target = base.mean(axis=1)
-    low, high = base[..., 2].min(), base[..., 2].max()
+    low = base[..., 2].min()
+    high = base[..., 2].max()
     target[:, 2] = 0.5 * (low + high)
     spread = np.linalg.norm((base - target[:, None])[..., :2], axis=2).max()
     return target, max(EYE_DISTANCE, 2.4 * (high - low)) + 1.3 * spread
@@ -256,7 +263,9 @@ def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
 def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray) -> _Plot:
     """Return the plot of one series, values (frames,); its legend omits the label of the only world."""
     commanded = quantity.startswith("command")
-    color, label, worlds = COMMAND_COLOR if commanded else ACTUAL_COLOR, quantity, _world_names(recording)
+    color = COMMAND_COLOR if commanded else ACTUAL_COLOR
+    label = quantity
+    worlds = _world_names(recording)
     for rank, world in enumerate(worlds):
         if f", {world} [" in quantity:
             several = len(worlds) > 1
@@ -273,10 +282,12 @@ def _blueprint(recording: "Recording") -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    start, end = float(recording.times[0]), float(recording.times[-1])
+    start = float(recording.times[0])
+    end = float(recording.times[-1])
     limits = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (start, end + LEGEND_SHARE * (end - start)))
     axis = rrb.TimeAxis(view_range=rr.TimeRange(*limits))
-    left, shares = [_scene_view(recording)], [1.0]
+    left = [_scene_view(recording)]
+    shares = [1.0]
     if recording.states:
         left.append(rrb.StateTimelineView(origin="/states", name="states", time_view=axis))
         shares.append(0.08 + 0.06 * len(recording.states))

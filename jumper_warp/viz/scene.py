@@ -44,7 +44,8 @@ def valid_frames(recording: Recording, rank: int) -> int:
 
 def without_divergence(recording: Recording) -> Recording:
     """Return a copy in which poses and contact points after `valid_frames` are NaN, so that they are not drawn."""
-    poses, points = recording.poses.copy(), recording.contact_points.copy()
+    poses = recording.poses.copy()
+    points = recording.contact_points.copy()
     for rank in range(len(recording.worlds)):
         count = valid_frames(recording, rank)
         poses[count:, recording.body_indices(rank)], points[count:, rank] = np.nan, np.nan
@@ -99,7 +100,8 @@ def _nearest(
     points: np.ndarray, target: np.ndarray, unit: np.ndarray, size: tuple[int, int], field_of_view: float
 ) -> float:
     """Return the least distance [m] from target to eye, along a unit vector, from which all points are in view."""
-    low, high = 0.1, 200.0
+    low = 0.1
+    high = 200.0
     for _ in range(40):
         distance = 0.5 * (low + high)
         pixels = View(target + distance * unit, target, field_of_view).project(points, size) / size
@@ -117,7 +119,8 @@ def follow(paths: np.ndarray, dt: float) -> np.ndarray:
     from scipy.ndimage import gaussian_filter1d  # takes 0.2 s, which a picture does not need
 
     middle = paths.mean(axis=1)
-    target, targets = middle[0], []
+    target = middle[0]
+    targets = []
     for position in middle:
         target = position + np.clip(target - position, -DEAD_ZONE, DEAD_ZONE)
         targets.append(target)
@@ -134,7 +137,8 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
     poses = recording.poses[:, recording.body_indices(rank)[0]].astype(float)
     commanded = np.append(turn_plane(recording.commands[frame, rank, :2], yaw_of(poses[frame, 3:])), 0.0)
     window = np.abs(recording.times - recording.times[frame]) <= 0.5 * VELOCITY_WINDOW + 1.0e-9
-    path, times = poses[window, :3], recording.times[window]
+    path = poses[window, :3]
+    times = recording.times[window]
     actual = (path[-1] - path[0]) / max(times[-1] - times[0], 1.0e-9) * [1.0, 1.0, 0.0]
     arrows = ((commanded, COMMAND_COLOR, 0.05), (actual, ACTUAL_COLOR, 0.0))
     return [
@@ -152,7 +156,8 @@ def annotate(
     size: height of the text relative to the image's height.
     """
     picture = Image.fromarray(image)
-    draw, pixels = ImageDraw.Draw(picture), max(11, round(size * picture.height))
+    draw = ImageDraw.Draw(picture)
+    pixels = max(11, round(size * picture.height))
     font = ImageFont.truetype(str(_font_file()), pixels)
     style = {"font": font, "fill": (30, 32, 36), "stroke_width": max(1, pixels // 9), "stroke_fill": (255, 255, 255)}
     if heading:

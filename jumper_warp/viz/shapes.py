@@ -82,8 +82,10 @@ def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimes
     heights = field.min_z + np.asarray(field.data) * (field.max_z - field.min_z)
     vertices = np.stack([*np.meshgrid(x, y), heights], axis=-1).reshape(-1, 3) * scale
     node = np.arange(field.nrow * field.ncol).reshape(field.nrow, field.ncol)
-    here, right = node[:-1, :-1].ravel(), node[:-1, 1:].ravel()
-    ahead, across = node[1:, :-1].ravel(), node[1:, 1:].ravel()
+    here = node[:-1, :-1].ravel()
+    right = node[:-1, 1:].ravel()
+    ahead = node[1:, :-1].ravel()
+    across = node[1:, 1:].ravel()
     triangles = [np.stack([here, right, across], axis=1), np.stack([here, across, ahead], axis=1)]
     return trimesh.Trimesh(vertices, np.concatenate(triangles))
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from jumper_warp.identification.motions import load_motions
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.utils.dumps import load_dump
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import read_report
+from jumper_warp.utils.output import read_values
 from jumper_warp.viz.recording import load_npz
 
 READERS = {
@@ -20,7 +20,7 @@ READERS = {
     "motion.parquet": lambda path: load_motions([path]),
     "robot.json": load_overlay,
     "recording.npz": load_npz,
-    "metrics.json": lambda path: read_report(path.parent),
+    "metrics.json": lambda path: read_values(path.parent),
     "policy/manifest.json": lambda path: load_policy(path.parent),
 }
 

@@ -17,11 +17,9 @@ from jumper_warp.cli.train import parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
-from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.runs import load_policy, open_policy
+from jumper_warp.policies.policy import Policy, load_policy, save_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy
@@ -117,12 +115,6 @@ def test_refuses_empty_values(capsys, tmp_path, monkeypatch, args, place):
     assert err == [f"jumper: empty value {place}"]
 
 
-def test_train_without_task_lists_tasks_and_exits_with_2(capsys):
-    code, out, err = run(capsys, "train")
-    assert (code, out, len(err)) == (2, "", 1) and "jumper train TASK [flags]" in err[0]
-    assert all(name in err[0] for name in TASKS)
-
-
 def test_input_error_prints_one_line(capsys, monkeypatch):
     def raise_input_error(*_):
         raise InputError("expected a,\n  got b")
@@ -190,12 +182,6 @@ def test_flag_exists_for_each_setting_outside_terms(name):
         else:
             args += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
     assert parsed(task, args) == task and len(settings) > 40
-
-
-def test_task_fields_without_flags_hold_functions_or_names():
-    flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
-    names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])
@@ -284,7 +270,7 @@ def test_refuses_settings_out_of_range(make, message):
 
 
 def test_exported_policy_equals_the_policy_of_the_run(trained_run):
-    policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
+    policy, same = load_policy(trained_run / "policy"), Policy.load(trained_run)
     assert policy.interface == same.interface and policy.interface.sizes == (147, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
     assert policy.recipe().task.curriculum.numbers["promote_after"] == 2
@@ -300,7 +286,7 @@ def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, c
     (empty / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
     code, out, err = run(capsys, "export", str(new.parent))
     assert (code, out, err) == (0, f"{new / 'policy'}\n", [f"{new}: best checkpoint, iteration 2"])
-    assert open_policy(old.parent).interface == load_policy(new / "policy").interface
+    assert Policy.load(old.parent).interface == load_policy(new / "policy").interface
     code, _, err = run(capsys, "evaluate", str(new.parent), "--save-to-policy", "--device", "cpu")
     assert code == 2 and err[-1].endswith(f"{new}: a run keeps no metrics; export it first")
 
@@ -399,14 +385,6 @@ def test_viewer_binds_to_loopback(tmp_path):
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
-def test_viewer_runs_no_code_of_the_working_directory(tmp_path):
-    (tmp_path / "rerun.py").write_text("raise SystemExit('code of the working directory')\n")
-    command = viewer_command(tmp_path / "jump.rrd")
-    version = [*command[: command.index("rerun") + 1], "--version"]
-    done = subprocess.run(version, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0 and "rerun" in done.stdout and "working directory" not in done.stderr
-
-
 def redirected(redirection, *args, **environment):
     """Return the finished process of a command whose streams a shell has redirected."""
     command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", *args]
@@ -417,17 +395,6 @@ def redirected(redirection, *args, **environment):
 def test_closed_streams_exit_with_0(redirection):
     done = redirected(redirection, "list")
     assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("args", [["list"], ["train", "vertical-jump", "--help"]], ids=" ".join)
-def test_full_disk_under_the_output_is_one_line(args):
-    done = redirected(">/dev/full", *args)
-    assert (done.returncode, done.stderr) == (2, "jumper: standard output: No space left on device\n")
-
-
-def test_characters_that_the_terminal_lacks_are_printed_as_escapes():
-    done = redirected("", "train", "vertical-jump", "--help-all", PYTHONIOENCODING="ascii")
-    assert done.returncode == 0 and r"\u03bb of generalised advantage" in done.stdout
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])

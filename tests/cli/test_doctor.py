@@ -55,18 +55,4 @@ def test_kernel_cache_that_cannot_be_made_is_named(variables, folder):
     command, environment = [sys.executable, "-m", "jumper_warp", "doctor"], environment | variables
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     message = f"jumper: kernel cache {folder}/{wp.config.version} cannot be written {NO_CACHE}\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", message)
-
-
-def test_kernel_cache_that_cannot_be_written_later_is_named(tmp_path):
-    file = tmp_path / "kernels.py"
-    file.write_text(
-        "import warp as wp\nfrom jumper_warp.utils.runtime import init_warp\n"
-        "@wp.kernel\ndef square(x: wp.array[float]):\n    x[0] *= x[0]\n"
-        "init_warp()\nwp.config.kernel_cache_dir = '/dev/null/kernels'\n"
-        "wp.launch(square, 1, [wp.zeros(1, dtype=float, device='cpu')], device='cpu')\n"
-    )
-    done = subprocess.run([sys.executable, str(file)], capture_output=True, text=True)
-    assert done.returncode == 1
-    line = f"jumper_warp.utils.errors.InputError: kernel cache /dev/null/kernels cannot be written {NO_CACHE}"
-    assert done.stderr.splitlines()[-1] == line
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr.endswith(message)

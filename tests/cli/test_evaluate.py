@@ -8,7 +8,7 @@ from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import write_trials
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS, with_jump_terminations
 from jumper_warp.utils.errors import InputError

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,13 +5,11 @@ from typing import Annotated, Literal
 import pytest
 import tyro
 
-import jumper_warp
 from cli_helpers import run
 from jumper_warp.cli.flags import list_flags
 from jumper_warp.cli.main import parse
-from jumper_warp.cli.train import SHORT_HELP, parse_train, report_cpu_time
+from jumper_warp.cli.train import SHORT_HELP, parse_train
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
 
@@ -94,15 +90,6 @@ def test_help_of_a_group_has_its_flags_only(capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [("engin", "did you mean 'engine'?"), ("wheels", "no group of flags 'wheels'; there are engine")],
-)
-def test_help_of_an_unknown_group_suggests_one(name, message):
-    with pytest.raises(InputError, match=message.replace("?", r"\?")):
-        parse_car("--help", name)
-
-
-@pytest.mark.parametrize(
     ("args", "message"),
     [
         (["A1", "--sed", "3"], "--seed INT"),
@@ -151,49 +138,6 @@ def test_help_of_a_group_of_a_task(capsys):
     assert code == 0 and "--env.rewards.jump-height.weight" in out and "--env.reset" not in out and "--ppo" not in out
 
 
-def test_misspelt_command_is_suggested(capsys):
-    assert run(capsys, "evalute") == (2, "", ["jumper: no command 'evalute'; did you mean 'evaluate'?"])
-
-
-@pytest.mark.parametrize("flag", ["-V", "--version"])
-def test_version(capsys, flag):
-    assert run(capsys, flag) == (0, f"jumper {jumper_warp.__version__}\n", [])
-
-
-@pytest.mark.parametrize("module", ["jumper_warp", "jumper_warp.cli.main"])
-def test_module_is_the_command(module):
-    done = subprocess.run([sys.executable, "-m", module, "fly"], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.startswith("jumper: no command 'fly'")
-
-
-def test_usage_lists_exit_codes(capsys):
-    _, out, _ = run(capsys, "--help")
-    assert max(map(len, out.splitlines())) <= 80
-    assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 3, 130))
-
-
-@pytest.mark.parametrize(
-    ("cfg", "preset", "presets", "message"),
-    [
-        (TrainCfg(threads=2), False, (),
-         "without a GPU this training takes about 10 h: 734.0 M steps at 20,000 steps/s\n"),
-        (TrainCfg(threads=1), False, ("laptop",),
-         "about 20 h: 734.0 M steps at 10,000 steps/s; settings for such a machine: --preset laptop\n"),
-        (TrainCfg(threads=1, num_envs=1024, max_iterations=140), True, (),
-         "about 8 min: 4.6 M steps at 10,000 steps/s\n"),
-        (TrainCfg(threads=4, num_envs=1024, max_iterations=140), True, (),
-         "about 4 min: 4.6 M steps at 20,000 steps/s\n"),
-        (TrainCfg(threads=1, max_seconds=120.0), False, ("a", "b"),
-         "2 min; settings for such a machine: --preset a or --preset b\n"),
-        (TrainCfg(threads=1, num_envs=64, max_iterations=2), False, ("laptop",), ""),
-    ],
-)  # fmt: skip
-def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, cfg, preset, presets, message):
-    report_cpu_time(cfg, 0, preset, presets)
-    err = capsys.readouterr().err
-    assert err.endswith(message) and err.count("\n") == (1 if message else 0)
-
-
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
 def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, capsys):
     recipe, _ = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
@@ -204,8 +148,3 @@ def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, cap
     assert recipe.train.ppo.hidden == (128, 64, 64) and recipe.train.ppo.desired_kl == 0.02
     widths = [max(end for _, end in each.layout("actor").values()) for each in (recipe.task, make_task(task))]
     assert widths[0] < widths[1]  # one step of observations
-
-
-def test_unknown_preset_is_refused_with_the_tasks_that_have_presets(capsys):
-    code, _, err = run(capsys, "train", "attitude", "--preset", "laptop")
-    assert code == 2 and "attitude has no preset 'laptop'" in err[-1] and "vertical-jump (laptop)" in err[-1]

@@ -7,7 +7,7 @@ import torch
 
 from cli_helpers import run
 from jumper_warp.cli import main as cli
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.rl.checkpoint import load_checkpoint
 
 TRAIN = "train horizontal-jump-mars --num-envs 4 --max-iterations 1 --device cpu --no-tensorboard".split()
@@ -25,7 +25,7 @@ def begun(tmp_path_factory):
 
 
 def test_training_starts_with_the_weights_of_the_policy(begun):
-    policy, trained = open_policy("slippery_jump"), open_policy(begun)
+    policy, trained = Policy.load("slippery_jump"), Policy.load(begun)
     for (weight, bias), (same_weight, same_bias) in zip(policy.layers, trained.layers, strict=True):
         torch.testing.assert_close(same_weight, weight, atol=1e-6, rtol=0.0)
         torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)

@@ -11,7 +11,7 @@ import pytest
 from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.kernels.jump import rewards
-from jumper_warp.policies.runs import load_policy, open_policy
+from jumper_warp.policies.policy import Policy, load_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.tasks.saving import TaskError
@@ -141,7 +141,7 @@ def test_export_does_not_need_the_module(capsys, runs, tmp_path):
     policy = load_policy(tmp_path / "policy")
     assert (code, err) == (0, [f"{runs['low-jump']}: best checkpoint, iteration {policy.config['iteration']}"])
     assert "my_jumps" not in sys.modules
-    assert policy.interface.task == "low-jump" and policy.interface == open_policy(runs["low-jump"]).interface
+    assert policy.interface.task == "low-jump" and policy.interface == Policy.load(runs["low-jump"]).interface
     assert run(capsys, "export", str(tmp_path / "policy"), "--out", str(tmp_path / "low.onnx"))[::2] == (0, [])
 
 
@@ -159,7 +159,7 @@ def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path)
 
 
 def test_recipe_uses_the_users_reward_function(runs, path):
-    config = open_policy(runs["tame-jump"]).config
+    config = Policy.load(runs["tame-jump"]).config
     with pytest.raises(TaskError, match=r"task.rewards\[0\].func needs 'my_jumps:base_at_rest'"):
         Recipe.from_json(config, [])
     module = load_task_module(path)

@@ -4,12 +4,12 @@ import numpy as np
 import openvino
 import torch
 
-from jumper_warp.policies.folder import find_policy
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.policy import Policy
 
 
 def test_policy_acts_as_in_torch_with_single_precision():
-    policy = open_policy("vertical_jump")
+    policy = Policy.load("vertical_jump")
     obs = np.random.default_rng(0).normal(0.0, 3.0, (64, len(policy.mean))).astype(np.float32)
     network = openvino.Core().compile_model(
         find_policy("vertical_jump") / "policy.onnx", "CPU", {"INFERENCE_PRECISION_HINT": "f32"}

@@ -11,7 +11,7 @@ from rsl_rl.runners import OnPolicyRunner
 from jumper_warp.cli import evaluate, export, play, train
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.rl.rsl_rl import rsl_rl_config
@@ -56,7 +56,7 @@ def test_random_network_distillation_trains(one_thread):
 def test_policy_of_a_checkpoint_acts_as_rsl_rls(trained):
     folder, runner = trained
     obs = torch.from_numpy(np.random.default_rng(0).normal(0.0, 3.0, (64, runner.env.env.num_obs))).float()
-    policy, actor = open_policy(folder / "model_1.pt"), runner.get_inference_policy()
+    policy, actor = Policy.load(folder / "model_1.pt"), runner.get_inference_policy()
     expected = actor({"actor": obs}).clamp(-1.0, 1.0)
     torch.testing.assert_close(policy.act(obs), expected, atol=2.0e-6, rtol=0.0)
     assert policy.act(obs).std() > 0.1 and (actor.obs_normalizer.std < 0.1).any()
@@ -65,7 +65,7 @@ def test_policy_of_a_checkpoint_acts_as_rsl_rls(trained):
 
 def test_folder_means_its_newest_checkpoint(trained):
     folder, _ = trained
-    newest, first = open_policy(folder), open_policy(folder / "model_0.pt")
+    newest, first = Policy.load(folder), Policy.load(folder / "model_0.pt")
     assert (newest.config["iteration"], first.config["iteration"]) == (1, 0)
     assert not torch.equal(newest.layers[0][0], first.layers[0][0])
 
@@ -76,9 +76,9 @@ def test_checkpoint_of_the_command_line_is_exported_evaluated_and_played(tmp_pat
     run = train.run(args.split()).folder
     for source in (run, run / "model_0.pt"):
         assert export.export(export.ExportCfg(str(source), overwrite=True)) == run / "policy"
-    exported = open_policy(run / "policy")
+    exported = Policy.load(run / "policy")
     obs = torch.randn(4, len(exported.mean))
-    assert torch.equal(exported.act(obs), open_policy(run / "model_0.pt").act(obs))
+    assert torch.equal(exported.act(obs), Policy.load(run / "model_0.pt").act(obs))
     evaluate.run([str(run), "--num-jumps", "2", "--device", "cpu", "--out", "metrics"], [])
     assert json.loads((tmp_path / "metrics" / "metrics.json").read_text())
     play.run([str(run / "model_0.pt"), "--device", "cpu", "--out", "film"], [])
@@ -89,7 +89,7 @@ def test_checkpoint_without_the_environments_configuration_is_refused(trained, t
     path = tmp_path / "model_7.pt"
     path.write_bytes((trained[0] / "model_1.pt").read_bytes())
     with pytest.raises(CheckpointError, match=re.escape(f"{path}: needs config.json beside it")):
-        open_policy(path)
+        Policy.load(path)
     path.with_name("config.json").write_text("{")
     with pytest.raises(CheckpointError, match=r"config\.json: not JSON"):
-        open_policy(path)
+        Policy.load(path)

@@ -15,11 +15,10 @@ from onnx.external_data_helper import convert_model_to_external_data
 
 from columns import ANG_VEL, QUAT, XY, X, Y, Z
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.onnx import export_onnx
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import export_onnx, load_policy
 from jumper_warp.policies.spec import checksum_entry
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values

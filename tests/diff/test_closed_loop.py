@@ -11,7 +11,7 @@ from jumper_warp.diff.closed_loop import ClosedLoop, heading_of
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.finetuning import make_groups
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 
@@ -21,7 +21,7 @@ G = 9.81  # [m/s^2]
 @cache
 def policy(name="vertical_jump"):
     """Return a shipped policy, opened once."""
-    return open_policy(name)
+    return Policy.load(name)
 
 
 @cache

@@ -19,7 +19,7 @@ import jumper_warp.cli.play  # its open_run is patched
 import jumper_warp.cli.train  # noqa: F401
 from jumper_warp.cli.main import COMMANDS, main
 from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.errors import InputError
 
@@ -155,7 +155,7 @@ class Commands:
         if path := getattr(settings, "out", None) or default:
             policy = args[0] in ("finetune", "export") and args[1] != "robot"
             if policy and not task:  # that of a user's module is the last training's
-                task = self.task if "--task-module" in args else open_policy(args[1]).recipe().task
+                task = self.task if "--task-module" in args else Policy.load(args[1]).recipe().task
             self.made[str(path)] = task
 
     def check_script(self, script, args):

@@ -13,7 +13,7 @@ import jumper_warp.gym  # registers the tasks
 from hold_height import hold_height, near_goal
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
-from jumper_warp.policies.conditions import Conditions
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm

@@ -8,10 +8,11 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.courses import SQUAT_TIME, CourseLog
+from jumper_warp.evaluation.run import SkillRun
 from jumper_warp.evaluation.scripts import parse_script
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillPolicies
+from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.overlay import RobotOverlay
 
@@ -43,12 +44,14 @@ class Switch:
 @pytest.fixture(scope="module")
 def followed():
     """Return policies, environment, course and all handovers of a nominal run whose stages are launched one by one."""
-    policies = SkillPolicies()
-    env = policies.env(N, Conditions(device="cpu", threads=1))
+    policies = SkillRun()
+    policies.conditions = Conditions(device="cpu", threads=1)
+    env = policies.env(N)
+    act = policies.actor(env)
     course, switches, fresh = CourseLog(SCRIPTS), [], []
     course.begin(env)
     for _ in range(round(course.seconds / env.step_dt)):
-        env.actions.copy_(policies.act(env))
+        env.actions.copy_(act(env.obs))
         for name, stage in env.stages().items():
             if name == "reset":
                 was = env.episodes.skill.numpy().copy()
@@ -124,7 +127,7 @@ def trained_with():
     """Return a function that loads the policies of the three skills as if trained with overlays of base masses [kg]."""
 
     def load(*masses):
-        policies = SkillPolicies()
+        policies = SkillRun()
         robots = [None if mass is None else RobotOverlay({"base_mass": (mass,)}, source="bench") for mass in masses]
         policies.recipes = [
             replace(recipe, robot=robot) for recipe, robot in zip(policies.recipes, robots, strict=True)
@@ -136,7 +139,8 @@ def trained_with():
 
 def mass_of(policies, **conditions):
     """Return the base mass [kg] of the robot of three skills."""
-    env = policies.env(1, Conditions(device="cpu", **conditions))
+    policies.conditions = Conditions(device="cpu", **conditions)
+    env = policies.env(1)
     return pytest.approx(float(env.sim.model.body_mass.numpy()[0]))
 
 
@@ -151,6 +155,6 @@ def test_skills_have_the_robot_of_their_training(trained_with, capfd):
 def test_skills_of_different_robots_need_a_choice(trained_with, tmp_path):
     policies = trained_with(8.0, None, 7.0)
     with pytest.raises(PolicyError, match=r"walking_flat and horizontal_jump .* different robots.* --robot FILE"):
-        policies.env(1, Conditions(device="cpu"))
+        policies.env(1)
     RobotOverlay({"base_mass": (9.0,)}).save(tmp_path / "robot.json")
     assert mass_of(policies, robot=tmp_path / "robot.json") == 9.0

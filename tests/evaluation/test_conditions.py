@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.kernels.jump.state import LANDED
-from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg
@@ -149,20 +149,6 @@ def test_randomised_conditions_keep_fixed_parameters():
     drawn = Conditions(randomize=True, gain_scale=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
     assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
     assert drawn.base_mass == RandomizationCfg().base_mass
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Conditions(latency=101.0), "latency must be in 0 to 100 ms"),
-        (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
-        (lambda: Conditions(friction=-0.1), "friction must be in 0 to 10, got -0.1"),
-        (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
-    ],
-)
-def test_refuses_invalid_conditions(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):

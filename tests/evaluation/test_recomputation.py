@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog
-from jumper_warp.policies.conditions import Conditions
 
 DT, COMMAND, SECOND = 1.0 / 60.0, 30, 60  # [s] policy step; [policy steps] command to jump, one second
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,9 +11,9 @@ from columns import Z
 from experiments import departures
 from experiments.departures import DEPARTURES, ablation_flags, parse, train_or_load
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.runs import load_policy
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.tasks.saving import task_from_json, task_to_json
@@ -25,13 +25,6 @@ def train_settings(task, name):
     """Return the recipe of a training of `task` without the departure `name`."""
     ablation = DEPARTURES[task][name]
     return parse(ablation, departures.Args(task=task).command(ablation, 1, Path("logs")))
-
-
-@pytest.mark.parametrize("task", DEPARTURES)
-def test_ablation_functions_change_task(task):
-    plain = parse_train([task])[0].task
-    for name, each in DEPARTURES[task].items():
-        assert ablation_flags(each) or each(plain) != plain, name
 
 
 @pytest.mark.parametrize("task", ["vertical-jump", "horizontal-jump"])
@@ -133,10 +126,3 @@ def test_training_with_max_seconds_saves_checkpoint(tmp_path):
     args = departures.Args(only=("drift",), iterations=1000, num_envs=4, train_flags=flags, device="cpu", threads=1)
     checkpoint = train_or_load("", args.command("", 1, tmp_path))
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
-
-
-def test_baseline_is_trained_with_baseline_seeds():
-    args = departures.Args(only=("kept", "drift"), seeds=(1,), baseline_seeds=(2, 3))
-    flags = [(name, seed, ablation) for name, seed, ablation in args.trainings()]
-    assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]
-    assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])

@@ -4,40 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from experiments import (
-    attitude,
-    benchmark_solver,
-    benchmark_training,
-    departures,
-    flight_attitude,
-    gradient_cost,
-    identification_starts,
-    learning_curves,
-    leg_springs,
-    measure_policies,
-    new_reward,
-    open_loop_jump,
-    paper_trainings,
-    soak_test,
-    squat_hold,
-    template,
-    trajectory_optimization,
-    walk_jump_walk,
-    walking_terrain,
-    walking_tracking,
-)
-from jumper_warp.envs.env import Env
+from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, new_reward, template
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
 from metric_helpers import values
@@ -226,24 +201,6 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
 
 
-def test_soak_counts_diverged_worlds_and_refuses_values_that_are_not_finite(tmp_path, monkeypatch):
-    args = soak_test.Args(num_envs=4, steps=5, hold_steps=5, tasks=("vertical-jump",), out=tmp_path, device="cpu")
-    values = soak_test.main(args)
-    assert values == read_values(tmp_path) and (values["steps"], values["non_finite_worlds"]) == (20, 0)
-    assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
-    step = Env.step
-    monkeypatch.setattr(Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    assert soak_test.main(args)["non_finite_worlds"] == 20  # all worlds in each step
-
-    def step_with_nan(env, action):
-        step(env, action)
-        env.reward[2] = torch.nan
-
-    monkeypatch.setattr(Env, "step", step_with_nan)
-    with pytest.raises(RuntimeError, match="5 rows hold values that are not finite, by step 5"):
-        soak_test.main(args)
-
-
 @dataclass
 class Flags:
     """Flags of a script."""
@@ -303,40 +260,3 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     assert values["cpu_ratio"] == pytest.approx(expected)
     for name in ("targets", "q", "qd", "table", "saturation"):
         assert 0.0 < values[f"error_{name}"] < 0.02
-
-
-@pytest.mark.parametrize(
-    ("kind", "flags", "message"),
-    [
-        (attitude.Args, {"num_turns": 3}, "num_turns must be at least 6"),
-        (departures.Args, {"only": ("bracing",)}, "not bracing"),
-        (departures.Args, {"iterations": 0}, "at least 1"),
-        (flight_attitude.Args, {"takeoff": "policy"}, "takeoff by a policy needs one"),
-        (flight_attitude.Args, {"height_range": (2.0, 1.0)}, "height_range must be in"),
-        (identification_starts.Args, {"shard": "3/2"}, "shard must be K/N"),
-        (learning_curves.Args, {"variants": ("faster",)}, "variants are default, .*, got 'faster'"),
-        (leg_springs.Args, {"stiffness": (-1.0,)}, "spring_stiffness must be in"),
-        (measure_policies.Args, {"policies": ("high_jump",)}, "no 'high_jump'; there are attitude"),
-        (open_loop_jump.Args, {"robot": Path("heavy.json"), "spring": (1000.0, 0.17)}, "springs or a robot"),
-        (paper_trainings.Args, {"arms": ("no_rewards",)}, "not no_rewards"),
-        (squat_hold.Args, {"height": (1.0, 0.5)}, "height must be in"),
-        (trajectory_optimization.Args, {"jumps": ("wings",)}, "no jump 'wings'"),
-        (walk_jump_walk.Args, {"num_robots": 0}, "robots"),
-        (walking_terrain.Args, {"speed": 0.9}, "speed"),
-        (walking_tracking.Args, {"commands_per_axis": 1}, "commands_per_axis"),
-    ],
-)
-def test_refuses_invalid_flags(kind, flags, message):
-    with pytest.raises(InputError, match=message):
-        kind(**flags)
-
-
-@pytest.mark.parametrize(
-    ("script", "message"),
-    [(attitude, "AttitudeEvaluation"), (flight_attitude, "needs a policy that turns"),
-     (walk_jump_walk, "VelocityEvaluation"), (walking_tracking, "VelocityEvaluation")],
-)  # fmt: skip
-def test_refuses_policy_of_another_task(script, message, tmp_path):
-    policy = "horizontal_jump" if script is flight_attitude else "vertical_jump"
-    with pytest.raises(PolicyError, match=message):
-        script.main(script.Args(policy=policy, out=tmp_path, device="cpu"))

@@ -6,9 +6,9 @@ import pytest
 
 from columns import X, Y
 from experiments import paper_tests
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import (
     Consecutive,
     Farthest,
@@ -19,9 +19,7 @@ from jumper_warp.evaluation.suites import (
     running_positions,
 )
 from jumper_warp.evaluation.sweeps import DistanceSweep
-from jumper_warp.policies.conditions import Conditions, env_of_recipe
-from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS
 from jumper_warp.utils.output import read_values
 from jumper_warp.utils.rotations import turn_plane
@@ -73,14 +71,6 @@ def test_sweep_metrics_count_ranges_by_distance():
     assert metrics["success_rate"] == pytest.approx(3 / 5)
     assert metrics["in_range_success_rate"] == pytest.approx(3 / 4)
     assert metrics["paper_training_range_success_rate"] == pytest.approx(1 / 2)
-
-
-def test_grid_repeats_every_goal():
-    goals = Grid(columns=3, rows=2, num_jumps=2).goals
-    assert goals.shape == (12, 1, 2)
-    assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
-    assert goals[-1, 0].tolist() == [1.4, 0.35]
-    assert len(Grid().goals) == 220
 
 
 def test_consecutive_metrics_match_hand_computed_values():
@@ -281,28 +271,3 @@ def test_standing_policy_has_error_of_full_distance(policy, tmp_path):
     saved = DistanceSweep(policy=policy, num_jumps=4, num_recorded=0, randomize=True, out=tmp_path, device="cpu").run()
     assert saved["goal_distance_at_end_mean_m"] == pytest.approx(0.9, abs=0.05)
     assert saved["randomize"] and saved["landed_rate"] == 0.0 and saved["trained_range_m"] == [0.2, 2.2]
-
-
-def test_refuses_policy_of_other_task(tmp_path):
-    needed = "expected a policy of a task with a PlaceEvaluation"
-    message = rf"{needed}, vertical_jump \(task vertical-jump\) has a HeightEvaluation"
-    with pytest.raises(PolicyError, match=message):
-        EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: EvaluationArgs(num_recorded=-1), "num_recorded must not be negative"),
-        (lambda: DistanceSweep(num_jumps=2), "at least 3 jumps"),
-        (lambda: Grid(rows=0), "at least one column and row"),
-        (lambda: Consecutive(rest_time=0.0), "rest_time must be in"),
-        (lambda: Platform(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
-        (lambda: Farthest(num_jumps=0), "at least 1 jump, got 0"),
-        (lambda: Farthest(min_distance=3.0), "0.1 <= min_distance <= max_distance <= 9 m, got 3.0 and 2.5"),
-        (lambda: Farthest(direction=200.0), "direction must be in -180..180 deg, got 200"),
-    ],
-)
-def test_refuses_invalid_settings(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

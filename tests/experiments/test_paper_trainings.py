@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments import paper_trainings
-from experiments.paper_trainings import ARMS, GAP, NEVER, OFF, arm_flags, make_log, names_of_tests, results_table
+from experiments.paper_trainings import GAP, NEVER, OFF, arm_flags, results_table
 from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.utils.output import read_values, write_metrics
@@ -34,26 +34,6 @@ def test_arms_switch_off_initialisation_estimates_and_curriculum(name):
     ends = [term for term, old in zip(blind.terminations, task.terminations, strict=True) if term != old]
     assert [term.numbers["tolerance"] for term in ends] == [OFF] * name.endswith("paper")
     assert set(changed_task(name, "no_curriculum").levels) == {task.levels[-1]}
-
-
-@pytest.mark.parametrize(
-    ("name", "tests"),
-    [(JUMPS[0], {"sweep": 5}), (JUMPS[1], {"straight": 5, "grid": 220}), ("velocity-paper", {"walk": 5})],
-)
-def test_tests_are_the_papers(name, tests):
-    task = make_task(name)
-    logs = {test: make_log(task, test, 5) for test in names_of_tests(task)}
-    assert {test: log.count for test, log in logs.items()} == tests
-    if "straight" in logs:
-        assert logs["straight"].goals[[0, -1], 0, :2].tolist() == [[0.3, 0.0], [1.5, 0.0]]
-    if "sweep" in logs:
-        assert logs["sweep"].goals[[0, -1], 0, 2].tolist() == [0.5, 1.2]
-
-
-def test_the_first_seed_of_every_arm_is_first_and_walking_has_no_ablation():
-    runs = list(paper_trainings.Args(seeds=(0, 1)).trainings())
-    assert len(runs) == 2 * (2 * len(ARMS) + 1) and {seed for _, _, seed in runs[: len(runs) // 2]} == {0}
-    assert [arm for name, arm, _ in runs if name == "velocity-paper"] == ["full", "full"]
 
 
 def test_the_metric_file_names_the_primary_metrics_before_the_training(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import walking_terrain, walking_tracking
-from jumper_warp.policies.folder import save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy

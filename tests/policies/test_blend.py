@@ -4,13 +4,10 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.policies.blend import blend
-from jumper_warp.policies.folder import save_policy
-from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy, blend, save_policy
 from jumper_warp.policies.spec import PolicyError
 
-HORIZONTAL = open_policy("horizontal_jump")
+HORIZONTAL = Policy.load("horizontal_jump")
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +48,11 @@ def test_blend_refuses_invalid_fractions_and_other_interfaces():
     with pytest.raises(PolicyError, match=r"fraction of a blend must be from 0 to 1, got 1\.1"):
         blend(HORIZONTAL, HORIZONTAL, 1.1)
     with pytest.raises(PolicyError, match="must have the same interface"):
-        blend(HORIZONTAL, open_policy("vertical_jump"), 0.5)
+        blend(HORIZONTAL, Policy.load("vertical_jump"), 0.5)
 
 
 def test_export_command_writes_a_blend(other, obs, tmp_path):
     save_policy(tmp_path / "other", other)
     main(["export", "horizontal_jump", "--blend", str(tmp_path / "other"), "0.25", "--out", str(tmp_path / "blend")])
     expected = blend(HORIZONTAL, other, 0.25).act(obs)
-    torch.testing.assert_close(open_policy(tmp_path / "blend").act(obs), expected, atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(Policy.load(tmp_path / "blend").act(obs), expected, atol=1e-6, rtol=0.0)

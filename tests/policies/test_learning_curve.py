@@ -3,7 +3,7 @@
 import itertools
 import json
 
-from jumper_warp.policies.runs import CURVE, CURVE_ROWS, thinned_curve
+from jumper_warp.policies.policy import CURVE, CURVE_ROWS, thinned_curve
 
 
 def test_thinned_curve_keeps_its_columns_and_evenly_spaced_rows():

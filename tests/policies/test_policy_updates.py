@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from jumper_warp.deploy.policy import JOINTS
-from jumper_warp.policies.folder import add_files, read_policy, save_policy
-from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.catalog import add_files
+from jumper_warp.policies.policy import Policy, save_policy
 from jumper_warp.policies.spec import PolicyInterface
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.utils.files import write_atomically
@@ -62,15 +62,15 @@ def test_policy_loads_after_an_update_that_was_stopped_at_any_file(folder, monke
     monkeypatch.setattr(os, "replace", fault)
     with pytest.raises(type(error)):
         add_files(folder, NEW)
-    read_policy(folder)
+    Policy.load(folder)
     for name, data in NEW.items():
         assert not (folder / name).exists() or (folder / name).read_bytes() in (OLD.get(name), data)
     assert [path.name for path in folder.iterdir() if path.name.endswith(".part")] == []
     add_files(folder, NEW)
-    read_policy(folder)
+    Policy.load(folder)
     (folder / "metrics.json").write_bytes(OLD["metrics.json"])  # an altered file after a complete update
     with pytest.raises(ValueError, match=r"metrics\.json: truncated or altered"):
-        read_policy(folder)
+        Policy.load(folder)
 
 
 def test_two_writers_and_a_reader_of_a_policy_leave_it_loadable(folder):
@@ -80,19 +80,19 @@ def test_two_writers_and_a_reader_of_a_policy_leave_it_loadable(folder):
 
     def read(_):
         for _ in range(60):
-            read_policy(folder)
+            Policy.load(folder)
 
     with ThreadPoolExecutor(3) as threads:
         jobs = [threads.submit(write, 1), threads.submit(write, 2), threads.submit(read, 0)]
         for job in jobs:
             job.result()
-    read_policy(folder)
+    Policy.load(folder)
     assert (folder / "1.json").read_bytes() == (folder / "2.json").read_bytes() == b"14"
     for name in ("1.json", "2.json"):  # both are in the manifest
         content = (folder / name).read_bytes()
         (folder / name).write_bytes(b"altered")
         with pytest.raises(ValueError, match="truncated or altered"):
-            read_policy(folder)
+            Policy.load(folder)
         (folder / name).write_bytes(content)
 
 
@@ -101,7 +101,7 @@ def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monk
     monkeypatch.setattr(os, "replace", RenameFault(stop, KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         save_policy(folder, small_policy(), overwrite=True)
-    read_policy(folder)
+    Policy.load(folder)
     assert (folder / "metrics.json").read_bytes() == OLD["metrics.json"]
     assert [path.name for path in folder.parent.iterdir()] == ["jump"]
 

@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.policies.runs import open_policy
-from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface, task_symmetry
+from jumper_warp.policies.policy import Policy, actor_init_from_policy, check_interface, task_symmetry
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.rl.networks import ActorCritic
@@ -26,7 +25,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a sym
     ],
 )
 def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
-    policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
+    policy, cfg, task = Policy.load(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
     symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
     assert (symmetry is not None) == (name == "slippery_jump" and not change)
     torch.manual_seed(0)
@@ -55,7 +54,7 @@ def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, mess
 
 
 def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
-    policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
+    policy, task, cfg = Policy.load("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
     symmetry = task_symmetry(task)
     start = actor_init_from_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
@@ -66,7 +65,7 @@ def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
 
 
 def test_scales_gains_and_an_unknown_layout_may_differ():
-    spec = open_policy("horizontal_jump").interface
+    spec = Policy.load("horizontal_jump").interface
     numbers = {name: tuple(1.5 for _ in spec.joint_names) for name in ("action_scale", "joint_stiffness")}
     other = dataclasses.replace(spec, **numbers, observation_layout={}, policy_dt=0.05)
     check_interface(other, interface(make_task("horizontal-jump-mars")))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
@@ -128,7 +128,7 @@ def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):
     config = {"env": env, "train": dataclasses.asdict(dataclasses.replace(TrainCfg(), ppo=cfg)), "commit": None}
     state = {"ppo": {"model": model.state_dict()}, "iteration": 3, "env": {}, "rng": {}}
     state["config"] = json.dumps(config, default=str)
-    policy = open_policy(save_checkpoint(tmp_path, state, None, 3))
+    policy = Policy.load(save_checkpoint(tmp_path, state, None, 3))
     obs = torch.randn(30, NUM_OBS)
     torch.testing.assert_close(policy.act(obs), model.act(obs), atol=1e-5, rtol=1e-5)
     assert policy.interface.sizes == (NUM_OBS, 16, 12, 12)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli.train import parse_train
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.run import EvaluationRun
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import PAW_FRICTION, RobotValues

@@ -1,6 +1,5 @@
 import json
 import math
-import os
 import sys
 from pathlib import Path
 
@@ -9,19 +8,6 @@ import pytest
 
 from jumper_warp.utils import output
 from jumper_warp.utils.metrics import MetricValue, unit_of
-
-
-def test_folder_that_another_process_makes_at_the_same_time_is_not_shared(tmp_path, monkeypatch):
-    make = Path.mkdir
-
-    def make_second(self, **settings):
-        if self.name.count("_") == 1:  # date_time, without a number
-            os.makedirs(self, exist_ok=True)
-        make(self, **settings)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Path, "mkdir", make_second)
-    assert output.output_dir("jump").name.endswith("_2")
 
 
 def test_metrics_file_holds_the_given_metrics(tmp_path):
@@ -40,25 +26,6 @@ def test_metrics_file_has_documented_layout(tmp_path):
     jsonschema.validate(document, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(document | {"version": 0}, schema)
-
-
-def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
-    report = output.write_metrics(tmp_path, {"drift_m": MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
-    assert json.loads(report.path.read_text()) == {
-        "schema": "jumper-warp metrics", "version": 1, "conditions": {"a": 1},
-        "metrics": {"drift_m": {"value": 0.5, "unit": "m", "trials": 4, "interval": [0.1, 0.9], "over": "jumps"}},
-    }  # fmt: skip
-    assert report.metrics == {"drift_m": MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
-
-
-def test_a_report_in_memory_is_the_one_in_the_file(tmp_path):
-    metrics = {
-        "drift_m": MetricValue(np.float32(0.1), 4, (0.1, np.float64(0.9)), "jumps"),
-        "bin_m": [np.int64(1), None],
-    }
-    report = output.write_metrics(tmp_path, metrics, {"seed": np.int32(3)})
-    assert output.read_report(tmp_path) == report
-    assert report.values == {"seed": 3, "drift_m": float(np.float32(0.1)), "bin_m": [1, None]}
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,3 @@ def test_summary_has_main_metrics_in_words_with_units_beside_the_papers_values(s
 def test_json_prints_the_file_and_nothing_else(summary):
     text, folder = summary(json=True)
     assert json.loads(text) == json.loads((folder / "metrics.json").read_text())
-
-
-def test_prints_files_beside_a_loop_of_links(summary, tmp_path):
-    (tmp_path / "loop").symlink_to("loop")
-    assert "a.png" in summary()[0]

@@ -18,6 +18,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_flag_fields, check_seed
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.streams import purpose_seed
 
@@ -63,7 +64,7 @@ class Conditions:
                 raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
         if self.gravity is not None:
             check_gravity(self.gravity)
-        self._with_fixed_parameters(RandomizationCfg.off())  # raises if a value is out of range
+        RandomizationCfg.off().with_fixed(**self.fixed_parameters)  # raises if a value is out of range
         if self.push_in_flight and not self.randomize:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
 
@@ -73,10 +74,14 @@ class Conditions:
         return purpose_seed(self.stream, self.seed)
 
     @property
-    def fixed_parameters(self) -> dict[str, Any]:
+    def fixed_parameters(self) -> Json:
         """Robot parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
-        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
-                  "sensor_offset": self.sensor_offset}  # fmt: skip
+        values = {
+            "latency": self.latency,
+            "gains": self.gain_scale,
+            "friction": self.friction,
+            "sensor_offset": self.sensor_offset,
+        }
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, trained: RobotOverlay | None) -> RobotOverlay | None:
@@ -86,7 +91,7 @@ class Conditions:
         """
         return trained if self.robot is None else load_overlay(self.robot)
 
-    def env_settings(self, trained: RobotOverlay | None) -> dict[str, Any]:
+    def env_settings(self, trained: RobotOverlay | None) -> Json:
         """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         fixed = fixed_ranges(**self.fixed_parameters)
@@ -98,10 +103,6 @@ class Conditions:
         """Whether the environment sets robot parameters at resets, to sampled or fixed values."""
         return self.randomize or bool(self.fixed_parameters)
 
-    def _with_fixed_parameters(self, ranges: RandomizationCfg) -> RandomizationCfg:
-        """Return a copy of randomisation ranges, in which each of `fixed_parameters` is constant."""
-        return ranges.with_fixed(**self.fixed_parameters)
-
     def applied(self, task: TaskCfg) -> TaskCfg:
         """Return a copy of a task with these conditions' gravity, randomisation and events, and collision margins 0 m.
 
@@ -111,12 +112,12 @@ class Conditions:
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
-            randomization = replace(self._with_fixed_parameters(trained.in_tests()), push_in_flight=in_flight)
+            randomization = replace(trained.in_tests().with_fixed(**self.fixed_parameters), push_in_flight=in_flight)
             return replace(task, randomization=randomization)
         if not self.fixed_parameters:
             return task
         nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
-        return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
+        return replace(task, randomization=nominal.with_fixed(**self.fixed_parameters), events=()).on_level_ground()
 
 
 def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditions) -> RobotOverlay | None:
@@ -140,9 +141,13 @@ def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditio
 
 
 def env_of_recipe(
-    recipe: Recipe, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    recipe: Recipe,
+    num_envs: int,
+    conditions: Conditions,
+    *,
+    change: Callable[[TaskCfg], TaskCfg] | None = None,
     **scene: Any,
-) -> Env:  # fmt: skip
+) -> Env:
     """Return the environment of a recipe's task in the given test conditions.
 
     It has no rewards, no critic observation, and events only if randomised.
