@@ -103,7 +103,7 @@ def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
     """
     cfg, flat = ppo.cfg, ppo.flat
     with torch.no_grad():
-        flat.actor.layers.weights[-1].mul_(30.0)  # the initial actions are too small to test the clipping
+        ppo.model.actor[-1].weight.mul_(30.0)  # the initial actions are too small to test the clipping
         ppo.collector.roll()
         ppo.batch()
         for segment in flat.segments:
@@ -145,7 +145,7 @@ def repeats(args: Args, device: torch.device) -> bool:
         ppo = build(args, device)
         for _ in range(4):  # eager, capture, replay
             ppo.iterate()
-        results.append([each.clone() for each in ppo.optimiser.vectors])
+        results.append([each.clone() for each in ppo.optimiser.tensors])
         ppo.close()
     return all(map(torch.equal, *results))
 

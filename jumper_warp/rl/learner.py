@@ -72,7 +72,7 @@ class Learner(ABC):
         self.model = ActorCritic(
             env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, self.symmetry,
         ).to(env.device)  # fmt: skip
-        self.flat = FlatParameters(self.model, cfg.activation)
+        self.flat = FlatParameters(self.model)
         self.optimiser = FlatAdam(self.flat, cfg.lr)
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)

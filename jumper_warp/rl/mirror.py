@@ -3,9 +3,6 @@
 A mirror map takes a vector x to its mirror image `signs * x[order]`; it is its own inverse. Let M be the mirror map of
 observations, N the mirror map of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2. For any
 weights it maps M x to the mirror image of its output for x.
-
-The forward and backward pass run once over twice the rows, x and M x. As N is a signed permutation and its own inverse,
-the gradient of a loss by f(M x) is N times the gradient by N f(M x).
 """
 
 from __future__ import annotations
@@ -42,12 +39,6 @@ class MirrorMap(NamedTuple):
         image = self.signs.to(mean.dtype) * mean[self.order]
         return 0.5 * (mean + image), 0.5 * (var + var[self.order]) + 0.25 * (mean - image).square()
 
-    def padded(self, columns: int) -> MirrorMap:
-        """Return the mirror map of vectors that are padded to `columns` entries; padding maps to itself."""
-        padding = torch.arange(len(self.order), columns, device=self.order.device)
-        signs = torch.cat([self.signs, torch.ones_like(padding, dtype=torch.float32)])
-        return MirrorMap(torch.cat([self.order, padding]), signs)
-
     def matrix(self) -> torch.Tensor:
         """Return the mirror map as a matrix (n, n), whose product with x is the mirror image."""
         return self.signs[:, None] * torch.eye(len(self.order), device=self.signs.device)[self.order]
@@ -58,10 +49,6 @@ class Symmetry(NamedTuple):
 
     obs: MirrorMap
     action: MirrorMap
-
-    def padded(self, columns: int) -> Symmetry:
-        """Return the mirror maps for observations that are padded to `columns` entries; the action's is unchanged."""
-        return Symmetry(self.obs.padded(columns), self.action)
 
 
 def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:

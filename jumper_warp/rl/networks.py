@@ -1,10 +1,4 @@
-"""Actor, critic, exploration noise, and the running statistics that normalise observations and values.
-
-`Layers` implements the forward and backward pass of a multilayer perceptron without autograd. The backward pass needs
-only the input of each layer, which is the output of the layer below. With y a layer's output, x its input and
-s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The derivative of each activation is a function of y:
-elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
-"""
+"""Actor, critic, exploration noise, and the running statistics that normalise observations and values."""
 
 from __future__ import annotations
 
@@ -15,7 +9,6 @@ from typing import NamedTuple
 
 import torch
 from torch import nn
-from torch.nn import functional
 
 from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
@@ -62,10 +55,9 @@ class Scaling(NamedTuple):
         """Return normalised values x in their original unit: x · std + mean."""
         return x * self.std + self.mean
 
-    def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
-        """Return observations (..., n) normalised, clipped, and zero-padded to (..., columns)."""
-        features = normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
-        return functional.pad(features, (0, columns - obs.shape[-1]))
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return observations (..., n) normalised, and clipped to ±NORMALISED_LIMIT."""
+        return normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
 
 
 def all_reduce_moments(local: Sequence[Moments]) -> list[Moments]:
@@ -194,17 +186,27 @@ class ActorCritic(nn.Module):
 
     def mean(self, features: torch.Tensor) -> torch.Tensor:
         """Return the policy's mean action, (..., num_actions), for normalised observations (..., num_obs)."""
+        return self.mean_and_asymmetry(features)[0]
+
+    def mean_and_asymmetry(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the mean action, and f(x) - N f(M x) (symbols: `jumper_warp.rl.mirror`), 0 without symmetry.
+
+        Both are (..., num_actions); features: (..., num_obs).
+        """
         if (symmetry := self.symmetry) is None:
-            return self.actor(features)
-        return 0.5 * (self.actor(features) + symmetry.action.apply(self.actor(symmetry.obs.apply(features))))
+            mean = self.actor(features)
+            return mean, torch.zeros_like(mean)
+        output, mirrored = self.actor(torch.stack([features, symmetry.obs.apply(features)]))
+        image = symmetry.action.apply(mirrored)
+        return 0.5 * (output + image), output - image
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actor's input for raw observations (..., num_obs): normalised, within ±NORMALISED_LIMIT."""
-        return self.obs_moments.scaling().features(obs, obs.shape[-1])
+        return self.obs_moments.scaling().features(obs)
 
     def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's input for raw observations (..., num_critic_obs): normalised and clipped."""
-        return self.critic_moments.scaling().features(critic_obs, critic_obs.shape[-1])
+        return self.critic_moments.scaling().features(critic_obs)
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (...), a normalised return, for normalised observations (..., num_critic_obs)."""
@@ -218,84 +220,3 @@ class ActorCritic(nn.Module):
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the mean action clipped to ±1, (..., num_actions), for raw observations (..., num_obs)."""
         return self.mean(self.features(obs)).clamp(-1.0, 1.0)
-
-
-class Layers(NamedTuple):
-    """Weights and biases of a multilayer perceptron, with a forward and a backward pass without autograd."""
-
-    weights: tuple[torch.Tensor, ...]  # (outputs, inputs) each; the first is zero-padded to `flat.ROW_ALIGNMENT`
-    biases: tuple[torch.Tensor, ...]  # (outputs,) each
-    activation: str  # elu, relu or tanh, after all layers but the last
-
-    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Return the network's output (batch, outputs), and the input of each layer for `backward`.
-
-        x: (batch, columns of the first weight).
-        """
-        layer_inputs = []
-        activation = getattr(functional, self.activation)
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            layer_inputs.append(x)
-            x = activation(functional.linear(x, weight, bias))
-        return functional.linear(x, self.weights[-1], self.biases[-1]), [*layer_inputs, x]
-
-    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
-        """Return the gradients of the loss with respect to each layer's weight and bias, by backpropagation.
-
-        layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss with respect to the output.
-        """
-        gradients: list[torch.Tensor] = []
-        for index in reversed(range(len(layer_inputs))):
-            x = layer_inputs[index]
-            gradients = [grad.t() @ x, grad.sum(0), *gradients]
-            if index > 0:
-                grad = _activation_backward(self.activation, grad @ self.weights[index], x)
-        return gradients
-
-
-class ActorTensors(NamedTuple):
-    """Policy network as tensors, with forward and backward pass without autograd (symbols: `jumper_warp.rl.mirror`)."""
-
-    layers: Layers
-    log_std: torch.Tensor  # (num_actions,) of the exploration noise
-    symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
-
-    def forward(self, x: torch.Tensor) -> ActorOutput:
-        """Compute the policy's mean action for normalised observations x; arguments: see `Layers.forward`."""
-        if self.symmetry is None:
-            mean, layer_inputs = self.layers.forward(x)
-            return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
-        outputs, layer_inputs = self.layers.forward(torch.cat([x, self.symmetry.obs.apply(x)]))
-        output, mirrored_output = outputs.chunk(2)
-        image = self.symmetry.action.apply(mirrored_output)
-        return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
-
-    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
-        """Return the gradients of the loss with respect to each layer's weight and bias, by backpropagation.
-
-        layer_inputs: from `forward`; grad: (batch, num_actions) gradient with respect to `ActorOutput.mean`.
-        """
-        if self.symmetry is None:
-            return self.layers.backward(layer_inputs, grad)
-        half = 0.5 * grad
-        return self.layers.backward(layer_inputs, torch.cat([half, self.symmetry.action.apply(half)]))
-
-
-class ActorOutput(NamedTuple):
-    """Result of the policy's forward pass: mean action, its deviation from mirror symmetry, and the layers' inputs."""
-
-    mean: torch.Tensor  # (batch, num_actions)
-    difference: torch.Tensor  # (batch, num_actions) f(x) - N f(M x); 0 without symmetry
-    layer_inputs: list[torch.Tensor]  # input of each layer, for `ActorTensors.backward`
-
-
-def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Return the gradient of the loss with respect to an activation function's input.
-
-    grad: gradient with respect to its output; output: its output; all have the same shape.
-    """
-    if activation == "elu":
-        return torch.addcmul(grad, grad, output.clamp(max=0.0))
-    if activation == "relu":
-        return grad * (output > 0.0)
-    return torch.addcmul(grad, grad, output.square(), value=-1.0)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import ROW_ALIGNMENT, aligned
 from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
 
@@ -25,6 +23,10 @@ class Batch(NamedTuple):
     advantage: torch.Tensor  # (batch,) normalised
     target: torch.Tensor  # (batch,) return, in the units of the critic's output
 
+    def rows(self) -> torch.Tensor:
+        """Join the fields to one row per sample, (batch, columns of `RowLayout`)."""
+        return torch.cat([*self[:4], torch.stack(self[4:], dim=1)], dim=1)
+
 
 class RolloutMoments(NamedTuple):
     """Mean, variance and count of the advantages, returns and observations of a rollout."""
@@ -36,55 +38,21 @@ class RolloutMoments(NamedTuple):
 
 
 class RowLayout(NamedTuple):
-    """Layout of one training sample in a row of a matrix: actor features, critic features, other data of `Batch`.
+    """Layout of training samples as rows of a matrix, which is written once per iteration and gathered per epoch."""
 
-    Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once per iteration and gathered
-    once per epoch.
-    """
-
-    num_obs: int  # numbers of entries without padding
+    num_obs: int
     num_critic_obs: int
     num_actions: int
 
     @property
-    def widths(self) -> tuple[int, int, int]:
-        """Numbers of columns of actor features, critic features and the rest, each a multiple of ROW_ALIGNMENT."""
-        obs, critic_obs = aligned(self.num_obs, ROW_ALIGNMENT), aligned(self.num_critic_obs, ROW_ALIGNMENT)
-        return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
-
-    def features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the actor's normalised observations in rows of training samples, zero-padded.
-
-        The result is (batch, columns of the first weight); rows: (batch, columns).
-        """
-        return rows[:, : self.widths[0]]
-
-    def critic_features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the critic's normalised observations in rows of training samples, zero-padded.
-
-        The result is (batch, columns of the first weight); rows: (batch, columns).
-        """
-        return rows[:, self.widths[0] : sum(self.widths[:2])]
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers of columns of the fields of `Batch`."""
+        return self.num_obs, self.num_critic_obs, self.num_actions, self.num_actions, 1, 1, 1, 1
 
     def split(self, rows: torch.Tensor) -> Batch:
-        """Split rows of training samples (batch, columns) into the fields of `Batch`, as views without padding."""
-        sizes = (self.num_obs, self.widths[0] - self.num_obs, self.num_critic_obs, self.widths[1] - self.num_critic_obs,
-                 self.num_actions, self.num_actions, 1, 1, 1, 1)  # fmt: skip
-        starts = list(accumulate(sizes, initial=0))
-        columns = [rows[:, start : start + size] for start, size in zip(starts, sizes, strict=False)]
-        features, _, critic_features, _, action, mean, *scalars = columns
+        """Split rows of training samples (batch, columns) into the fields of `Batch`, as views."""
+        features, critic_features, action, mean, *scalars = rows.split(self.sizes, dim=1)
         return Batch(features, critic_features, action, mean, *(each[:, 0] for each in scalars))
-
-    def pack(self, batch: Batch) -> torch.Tensor:
-        """Join the fields of training samples to one zero-padded row each, (batch, columns); inverts `split`."""
-        scalars = torch.stack([batch.log_prob, batch.value, batch.advantage, batch.target], dim=-1)
-        groups = ([batch.features], [batch.critic_features], [batch.action, batch.mean, scalars])
-        pieces: list[torch.Tensor] = []
-        for group, width in zip(groups, self.widths, strict=True):
-            pieces += group
-            if padding := width - sum(each.shape[1] for each in group):
-                pieces.append(scalars.new_zeros(scalars.shape[0], padding))
-        return torch.cat(pieces, dim=1)
 
 
 def gae(

@@ -1,13 +1,11 @@
 """PPO's update against a reference with autograd, torch.optim.Adam and a loop over time."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
 from jumper_warp.rl.torch.ppo import Ppo
 from ppo_oracle import reference_losses
@@ -123,37 +121,3 @@ def test_samples_agree_with_a_loop_over_time():
     torch.testing.assert_close(batch["value"], head, **close)
     log_prob = gaussian_log_prob(rollout.action, rollout.mean, rollout.log_std).flatten()
     torch.testing.assert_close(batch["log_prob"], log_prob, **close)
-
-
-def test_flat_adam_agrees_with_torch_over_many_steps():
-    torch.manual_seed(0)
-    model = ActorCritic(5, 3, (7, 4), num_critic_obs=6)
-    theirs = [param.detach().clone().requires_grad_() for param in model.actor.parameters()]
-    flat = FlatParameters(model, "elu")
-    ours, optimiser = FlatAdam(flat, 1e-2), torch.optim.Adam(theirs, lr=1e-2)
-    for step in range(2000):
-        for index, param in enumerate(theirs):
-            param.grad = torch.randn_like(param) * 10.0 ** (index - 4) + math.cos(0.1 * step)
-            flat.params[index].grad.copy_(param.grad)
-        adam_step(ours.vectors)
-        optimiser.step()
-        if step in (0, 10, 1999):
-            for our_param, param in zip(flat.params, theirs, strict=False):
-                torch.testing.assert_close(our_param.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
-    padding = torch.ones_like(flat.value)
-    for segment in flat.segments:
-        segment.view(padding).zero_()
-    assert padding.sum() > 100.0
-    assert not (padding * flat.value).any()  # stays zero
-
-
-def test_forward_and_backward_agree_with_autograd():
-    torch.manual_seed(0)
-    model = ActorCritic(8, 3, (32, 16))
-    layers = FlatParameters(model, "elu").actor.layers
-    x, grad = torch.randn(64, 8), torch.randn(64, 3)
-    expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), grad)
-    output, layer_inputs = layers.forward(x)
-    torch.testing.assert_close(output, model.actor(x), atol=1e-6, rtol=1e-5)
-    for gradient, reference in zip(layers.backward(layer_inputs, grad), expected, strict=True):
-        assert (gradient - reference).norm() < 1e-5 * reference.norm()

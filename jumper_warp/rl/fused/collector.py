@@ -8,12 +8,12 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.flat import aligned
 from jumper_warp.rl.fused import kernels
 from jumper_warp.rl.fused.networks import FusedModel, blocks, launch
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic, Moments, RunningMoments, Scaling
-from jumper_warp.rl.samples import RowLayout
 
+SAMPLE_ALIGNMENT = 8  # Numbers of columns of `FusedRollout.samples` are a multiple of this
 ROWS = 64  # Number of samples in a block of the kernels of this module
 
 
@@ -23,7 +23,7 @@ class FusedRollout(NamedTuple):
     features: torch.Tensor  # (num_steps, num_envs, padded num_obs)
     critic_features: torch.Tensor  # (num_steps + 1, num_envs, padded num_critic_obs)
     final_features: torch.Tensor  # (num_steps, num_envs, padded num_critic_obs) after the step, before a reset
-    samples: torch.Tensor  # (num_steps, num_envs, columns) the part of `RowLayout` that is not features
+    samples: torch.Tensor  # (num_steps, num_envs, columns) action, mean, and scalars of `Batch`, zero-padded
     action: torch.Tensor  # (num_steps, num_envs, num_actions)
     log_std: torch.Tensor  # (num_actions,) of the policy, the same in all steps
     reward: torch.Tensor  # (num_steps, num_envs) times `PpoCfg.reward_scale`
@@ -66,14 +66,14 @@ class ObservationWriter:
 class FusedCollector:
     """Collector of rollouts that samples actions with the fused kernels; it has the interface of `Collector`."""
 
-    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, fused: FusedModel) -> None:
-        """Allocate the memory of a rollout; flat, fused: parameters and networks of `model`."""
-        self.env, self.cfg, self._fused, self._actor = env, cfg, fused, flat.actor
+    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, fused: FusedModel) -> None:
+        """Allocate the memory of a rollout; fused: networks of `model`."""
+        self.env, self.cfg, self._fused, self._log_std = env, cfg, fused, model.log_std
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
         steps, worlds, device, dtype = cfg.num_steps, env.num_envs, env.device, fused.weights.dtype
         width, critic_width = (layers[0].inputs for layers in (fused.layout.actor, fused.layout.critic))
-        columns = RowLayout(env.num_obs, self._critic_obs.shape[1], env.num_actions).widths[2]
+        columns = aligned(2 * env.num_actions + 4, SAMPLE_ALIGNMENT)
         critic_features = torch.zeros(2 * steps + 1, worlds, critic_width, dtype=dtype, device=device)
         self.critic_inputs = critic_features.view(-1, critic_width)
         """Features of `critic_features`, then `final_features`, (samples, width)."""
@@ -81,8 +81,8 @@ class FusedCollector:
         self.rollout = FusedRollout(
             torch.zeros(steps, worlds, width, dtype=dtype, device=device), critic_features[: steps + 1],
             critic_features[steps + 1 :], torch.zeros(steps, worlds, columns, device=device),
-            torch.zeros(steps, worlds, env.num_actions, device=device), torch.zeros_like(flat.actor.log_std), reward,
-            done, timeout,
+            torch.zeros(steps, worlds, env.num_actions, device=device), torch.zeros(env.num_actions, device=device),
+            reward, done, timeout,
         )  # fmt: skip
         self.obs = ObservationWriter(model.obs_moments, self.rollout.features, steps)
         self.critic_obs = ObservationWriter(model.critic_moments, critic_features, steps)
@@ -95,7 +95,7 @@ class FusedCollector:
         self.obs.begin()
         self.critic_obs.begin()
         self._fused.copy_weights()
-        self.rollout.log_std.copy_(self._actor.log_std)
+        self.rollout.log_std.copy_(self._log_std)
         self.rollout.action.normal_()
         for step in range(self.cfg.num_steps):
             self.act(step)
@@ -110,7 +110,7 @@ class FusedCollector:
         self.critic_obs.write(self._critic_obs, rollout.critic_features[step], step)
         output = fused.actor.forward(rollout.features[step], worlds)
         launch(kernels.sample_action, (blocks(worlds, ROWS),))(
-            output, fused.mirror, self._actor.log_std, rollout.action[step], rollout.samples[step], worlds,
+            output, fused.mirror, self._log_std, rollout.action[step], rollout.samples[step], worlds,
             self.env.num_actions, rollout.samples.shape[2], fused.mirrored, fused.actor.width, ROWS,
         )  # fmt: skip
 

@@ -51,7 +51,7 @@ class FusedLayout:
         """Assign places to actor, noise, critic and losses; symmetry: the actor's, if it is mirror-symmetric."""
         self.size = WIDTH
         self._flat, self._table = flat, torch.zeros(3, flat.all_reduced.numel(), dtype=torch.int64)
-        count = 2 * len(flat.actor.layers.weights)
+        count = len(flat.segments) // 2  # parameters of the actor, as many as of the critic; the noise is between
         obs = symmetry and MirrorMap(*(part.cpu() for part in symmetry.obs))
         self.actor = self._network(flat.segments[:count], obs)
         noise = flat.segments[count]
@@ -80,7 +80,7 @@ class FusedLayout:
             )  # fmt: skip
             self.size = layer.bias + layer.outputs
             out, col = torch.arange(num_out)[:, None], torch.arange(num_in)[None, :]
-            index = weight.start + out * weight.padded_shape[1] + col
+            index = weight.start + out * num_in + col
             self._table[0, index] = layer.weight + out * layer.inputs + col
             self._table[0, bias.start + out[:, 0]] = layer.bias + out[:, 0]
             if mirror is not None:

@@ -26,7 +26,7 @@ class FusedPpo(Learner):
         dtype = torch.bfloat16 if env.device.type == "cuda" else torch.float32
         rows = max(self.batch_size // cfg.minibatches, env.num_envs)
         self.networks = FusedModel(self.model, self.flat, rows, dtype)
-        self.collector = FusedCollector(env, cfg, self.model, self.flat, self.networks)
+        self.collector = FusedCollector(env, cfg, self.model, self.networks)
         self.rollout = self.collector.rollout
         self.fused = FusedUpdate(
             self.collector, cfg, self.model, self.optimiser, self.networks, (self._desired_kl, self._entropy_coef),
@@ -39,7 +39,7 @@ class FusedPpo(Learner):
 
         Raises InputError: Triton cannot compile them.
         """
-        modified = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
+        modified = [*self.optimiser.tensors, self._sums, self.collector.episode, self.collector.finished]
         originals = [tensor.clone() for tensor in modified]
         try:
             self.fused.warm_up()

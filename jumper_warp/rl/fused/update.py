@@ -116,8 +116,8 @@ class FusedUpdate:
 
     def _actor_gradient(self, samples: torch.Tensor) -> None:
         """Compute PPO's gradients of actor and noise; write them and the actor's losses as partial sums."""
-        fused, flat, rows = self._fused, self._flat, len(samples)
-        partial, layout, log_std = fused.partial, fused.layout, flat.actor.log_std
+        fused, rows = self._fused, len(samples)
+        partial, layout, log_std = fused.partial, fused.layout, self._model.log_std
         output = fused.actor.forward(self._features, rows, samples)
         launch(kernels.actor_loss, (SPLITS,), num_warps=8)(
             output, fused.mirror, self._samples, self._samples.shape[1], samples, log_std,
@@ -135,7 +135,7 @@ class FusedUpdate:
         launch(kernels.critic_loss, (SPLITS,), num_warps=8)(
             output, self._samples, self._samples.shape[1], samples, critic.grad_output,
             partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows),
-            len(self._flat.actor.log_std), cfg.clip, cfg.value_coef, cfg.clip_value, critic.width, LOSS_ROWS,
+            len(self._model.log_std), cfg.clip, cfg.value_coef, cfg.clip_value, critic.width, LOSS_ROWS,
         )  # fmt: skip
         critic.backward(self._critic_features, rows, samples)
 
@@ -143,8 +143,8 @@ class FusedUpdate:
         """Adapt the learning rate, clip the gradient, and run a step of Adam."""
         flat, cfg, adam, squares = self._flat, self._cfg, self._optimiser, self._squares
         launch(kernels.prepare_step, (len(squares),))(
-            flat.all_reduced, squares, adam.lr, adam.step, self._factors, self._desired_kl, flat.size, flat.actor_size,
-            cfg.min_lr, cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
+            flat.all_reduced, squares, adam.lr, adam.step_count, self._factors, self._desired_kl, flat.size,
+            flat.actor_size, cfg.min_lr, cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
         )  # fmt: skip
         launch(kernels.adam_step, (blocks(flat.size, ADAM_BLOCK),))(
             flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, self._factors,

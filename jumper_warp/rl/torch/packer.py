@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, gaussian_log_prob
+from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, gaussian_log_prob
 from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, gae, update_statistics
 from jumper_warp.rl.torch.rollout import RolloutBuffer
 
@@ -37,18 +36,14 @@ class BatchPacker:
     """Converter of a rollout to PPO's training samples, with advantages and returns, one per row of `rows`."""
 
     def __init__(
-        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
-        obs_mirror: MirrorMap | None = None,
-    ) -> None:  # fmt: skip
-        """Allocate memory for the training samples of a rollout.
-
-        flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics.
-        """
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, obs_mirror: MirrorMap | None = None
+    ) -> None:
+        """Allocate memory for the training samples of a rollout; obs_mirror: symmetrises observation statistics."""
         self._obs_mirror = obs_mirror
-        self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic
+        self._rollout, self._cfg, self._model = rollout, cfg, model
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
-        self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
+        self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.sizes))
         """Packed samples, (steps · worlds, columns of `layout`), time-major."""
         self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
         self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
@@ -69,30 +64,29 @@ class BatchPacker:
 
     def _estimates(self, scalings: Scalings) -> Estimates:
         """Compute values, advantages and returns of the rollout."""
-        return compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
+        return compute_values_and_gae(self._rollout, self._model, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
         """Write the rollout's samples with values, advantages and returns to `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         write_rows(
-            self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
+            self.rows, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
             self._chunk_size,
         )  # fmt: skip
 
 
 def compute_values_and_gae(
-    buffer: RolloutBuffer, critic: Layers, scalings: Scalings, cfg: PpoCfg, chunk_size: int | None
+    buffer: RolloutBuffer, model: ActorCritic, scalings: Scalings, cfg: PpoCfg, chunk_size: int | None
 ) -> Estimates:
     """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
     A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
     """
-    columns = critic.weights[0].shape[1]
 
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
         scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
-        heads = [critic.forward(scaling.features(chunk, columns))[0] for chunk in chunks]
+        heads = [model.value_head(scaling.features(chunk)) for chunk in chunks]
         return torch.cat(heads).view(critic_obs.shape[:2])
 
     head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
@@ -105,7 +99,7 @@ def compute_values_and_gae(
 
 
 def write_rows(
-    rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
+    rows: torch.Tensor, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
     advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
     """Normalise a rollout's training samples, and write them to `rows` (batch, columns of `layout`), one per row.
@@ -117,10 +111,10 @@ def write_rows(
     steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
     pieces = [rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
     for out, obs, critic_obs, action, mean, *estimated in zip(*[_chunks(x, chunk_size) for x in pieces], strict=True):
-        features = scalings.obs.features(obs, layout.num_obs)
-        critic_features = scalings.critic_obs.features(critic_obs, layout.num_critic_obs)
+        features = scalings.obs.features(obs)
+        critic_features = scalings.critic_obs.features(critic_obs)
         log_prob = gaussian_log_prob(action, mean, buffer.log_std)
-        out.copy_(layout.pack(Batch(features, critic_features, action, mean, log_prob, *estimated)))
+        out.copy_(Batch(features, critic_features, action, mean, log_prob, *estimated).rows())
 
 
 def _chunks(x: torch.Tensor, chunk_size: int | None) -> tuple[torch.Tensor, ...]:

@@ -13,18 +13,19 @@ import torch
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import all_reduce_mean
-from jumper_warp.rl.flat import AdamVectors, adam_step, adapted_lr, clip_gradient, flatten_aligned
+from jumper_warp.rl.flat import FlatAdam, adapted_lr, clip_gradient
 from jumper_warp.rl.learner import Learner, StepStatistics
-from jumper_warp.rl.networks import ActorTensors, Layers, gaussian_kl, gaussian_log_prob
-from jumper_warp.rl.samples import Batch, RowLayout
+from jumper_warp.rl.networks import ActorCritic, gaussian_kl, gaussian_log_prob
+from jumper_warp.rl.samples import Batch
 from jumper_warp.rl.torch.packer import BatchPacker
 from jumper_warp.rl.torch.rollout import Collector
 
 
-class ActorLosses(NamedTuple):
-    """PPO's surrogate loss, and entropy, left-right asymmetry and KL divergence of the policy, on a minibatch."""
+class Losses(NamedTuple):
+    """Losses of PPO, and entropy, left-right asymmetry and KL divergence of the policy, on a minibatch, each ()."""
 
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
+    value: torch.Tensor  # value loss before weighting [variances of the return]
     entropy: torch.Tensor  # entropy of the policy [nat]
     asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry
     kl: torch.Tensor  # KL(old ‖ new) [nat]
@@ -36,10 +37,10 @@ class Ppo(Learner):
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build networks and buffers; arguments and errors as `Learner`."""
         super().__init__(env, cfg)
-        self.collector = Collector(env, cfg, self.model, self.flat)
+        self.collector = Collector(env, cfg, self.model)
         self.rollout = self.collector.rollout
         obs_mirror = self.symmetry and self.symmetry.obs
-        self.packer = BatchPacker(self.rollout, cfg, self.model, self.flat, obs_mirror)
+        self.packer = BatchPacker(self.rollout, cfg, self.model, obs_mirror)
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._capture()
 
@@ -63,82 +64,53 @@ class Ppo(Learner):
         rows: samples (batch, columns of `packer.layout`).
         """
         flat, packer, cfg = self.flat, self.packer, self.cfg
-        value_loss = critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
-        losses = actor_gradient(
-            rows, packer.layout, flat.actor, packer.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
-        )
+        flat.gradient.zero_()
+        with torch.enable_grad():
+            losses = ppo_losses(self.model, packer.layout.split(rows), packer.old_log_std, cfg)
+            bonus = self._entropy_coef * losses.entropy
+            (losses.surrogate + cfg.value_coef * losses.value - bonus).backward()
         flat.kl.copy_(losses.kl)
         all_reduce_mean(flat.all_reduced)  # gradient and divergence
-        return optimiser_step(
-            self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
-        )
+        return optimiser_step(self.optimiser, self._desired_kl, cfg, losses, self._sums)
 
 
-def critic_gradient(
-    rows: torch.Tensor, layout: RowLayout, critic: Layers, cfg: PpoCfg, out: torch.Tensor
-) -> torch.Tensor:
-    """Compute the gradient of PPO's value loss with respect to the critic's parameters.
+def ppo_losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg: PpoCfg) -> Losses:
+    """Return the losses of PPO on a minibatch; only the first three have a gradient.
 
-    Writes the gradient of the weighted loss to `out`, and returns the value loss () before weighting. The loss is the
-    squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to within `clip` of
-    the rollout's value.
-
-    rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
+    The surrogate is that of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
+    The value loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value
+    clipped to within `clip` of the rollout's value. old_log_std: (num_actions,) of the policy that acted.
     """
-    batch = layout.split(rows)
-    output, layer_inputs = critic.forward(layout.critic_features(rows))
-    value_change = output.squeeze(-1) - batch.value
-    error = output.squeeze(-1) - batch.target
-    loss, grad = error.square(), error
+    mean, difference = model.mean_and_asymmetry(batch.features)
+    ratio = torch.exp(gaussian_log_prob(batch.action, mean, model.log_std) - batch.log_prob)
+    clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
+    surrogate = -torch.minimum(batch.advantage * ratio, batch.advantage * clipped).mean()
+    value = model.value_head(batch.critic_features)
+    loss = (value - batch.target).square()
     if cfg.clip_value:
-        clipped_error = batch.value + value_change.clamp(-cfg.clip, cfg.clip) - batch.target
-        grad = torch.where(clipped_error.square() > loss, clipped_error * (value_change.abs() <= cfg.clip), error)
-        loss = torch.maximum(loss, clipped_error.square())
-    grad_output = grad * (2.0 * cfg.value_coef / rows.shape[0])
-    out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None])))
-    return loss.mean()
-
-
-def actor_gradient(
-    rows: torch.Tensor, layout: RowLayout, actor: ActorTensors, old_log_std: torch.Tensor, entropy_coef: torch.Tensor,
-    cfg: PpoCfg, out: torch.Tensor,
-) -> ActorLosses:  # fmt: skip
-    """Compute the gradient of PPO's surrogate loss and entropy bonus with respect to actor and noise.
-
-    Writes it to `out`, and returns the losses. The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss:
-    -E[min(r A, clip(r) A)] with r = π(a) / π_old(a). Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
-
-    rows: (batch, columns of `layout`); entropy_coef: (); out: the slice of actor and noise of the flat gradient.
-    """
-    batch, log_std = layout.split(rows), actor.log_std
-    mean, difference, layer_inputs = actor.forward(layout.features(rows))
-    ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
-    objective = batch.advantage * ratio
-    clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
-    grad_log_prob = torch.where(objective > clipped, 0.0, objective)[:, None] / -rows.shape[0]
-    z = (batch.action - mean) * torch.exp(-log_std)
-    grad_log_std = (grad_log_prob * (z.square() - 1.0)).sum(0) - entropy_coef
-    gradients = actor.backward(layer_inputs, grad_log_prob * z * torch.exp(-log_std))
-    out.copy_(flatten_aligned([*gradients, grad_log_std]))
-    entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
-    kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()
-    return ActorLosses(-torch.minimum(objective, clipped).mean(), entropy, difference.square().mean(), kl)
+        near = batch.value + (value - batch.value).clamp(-cfg.clip, cfg.clip)
+        loss = torch.maximum(loss, (near - batch.target).square())
+    entropy = (model.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+    with torch.no_grad():
+        kl = gaussian_kl(batch.mean, old_log_std, mean, model.log_std).mean()
+        asymmetry = difference.square().mean()
+    return Losses(surrogate, loss.mean(), entropy, asymmetry, kl)
 
 
 def optimiser_step(
-    vectors: AdamVectors, actor_size: int, kl: torch.Tensor, desired_kl: torch.Tensor, cfg: PpoCfg, losses: ActorLosses,
-    value_loss: torch.Tensor, sums: torch.Tensor,
-) -> StepStatistics:  # fmt: skip
+    optimiser: FlatAdam, desired_kl: torch.Tensor, cfg: PpoCfg, losses: Losses, sums: torch.Tensor
+) -> StepStatistics:
     """Run one step of Adam with an adapted learning rate and a clipped gradient; return losses and gradient norms.
 
-    The rate adapts to the KL divergence kl (). A non-finite gradient is replaced by 0. sums: (len(STATISTICS) + 1,)
-    running sums of the statistics, and the number of steps; updated in place.
+    The rate adapts to `FlatParameters.kl`. A non-finite gradient is replaced by 0. sums: (len(STATISTICS) + 1,) running
+    sums of the statistics, and the number of steps; updated in place.
     """
-    vectors.lr.copy_(adapted_lr(vectors.lr, kl, cfg, desired_kl))
-    norms = clip_gradient(vectors.gradient, actor_size, cfg.max_grad_norm)
-    adam_step(vectors)
+    flat = optimiser.flat
+    optimiser.lr.copy_(adapted_lr(optimiser.lr, flat.kl, cfg, desired_kl))
+    norms = clip_gradient(flat.gradient, flat.actor_size, cfg.max_grad_norm)
+    optimiser.step()
     skipped = 1.0 - norms.isfinite().all().float()
-    surrogate, entropy, asymmetry, _ = losses
-    step = StepStatistics(surrogate, value_loss, entropy, asymmetry, kl.clone(), norms[0], norms[1], skipped)
-    sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(kl)]), nan=0.0, posinf=0.0, neginf=0.0))
+    parts = [part.detach() for part in losses[:4]]
+    step = StepStatistics(*parts, flat.kl.clone(), norms[0], norms[1], skipped)
+    sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(skipped)]), nan=0.0, posinf=0.0, neginf=0.0))
     return step

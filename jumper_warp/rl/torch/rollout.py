@@ -8,8 +8,7 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
+from jumper_warp.rl.networks import ActorCritic, Scaling
 
 
 class RolloutBuffer(NamedTuple):
@@ -47,14 +46,14 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
 class Collector:
     """Collector of rollouts: steps the environment with the current policy, and records transitions in `rollout`."""
 
-    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters) -> None:
-        """Allocate the memory of a rollout; model: has the observation statistics; flat: parameters of `model`."""
+    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic) -> None:
+        """Allocate the memory of a rollout; model: the policy with its observation statistics."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
         self.rollout = make_rollout_buffer(cfg.num_steps, env, self._critic_obs.shape[1])
         self._steps = [self.rollout.at(step) for step in range(cfg.num_steps)]
-        self._moments, self._actor = model.obs_moments, flat.actor
+        self._model = model
         self._scaling = Scaling(*(torch.zeros(env.num_obs, device=env.device) for _ in Scaling._fields))
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self.episode = torch.zeros(2, env.num_envs, **counts)
@@ -66,9 +65,9 @@ class Collector:
     def roll(self) -> None:
         """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout."""
         env, rollout = self.env, self.rollout
-        for scaling, value in zip(self._scaling, self._moments.scaling(), strict=True):
+        for scaling, value in zip(self._scaling, self._model.obs_moments.scaling(), strict=True):
             scaling.copy_(value)
-        rollout.log_std.copy_(self._actor.log_std)
+        rollout.log_std.copy_(self._model.log_std)
         rollout.action.normal_()
         for step in self._steps:
             self._act_step(step)
@@ -79,7 +78,7 @@ class Collector:
 
     def _act_step(self, step: RolloutBuffer) -> None:
         """Sample actions for the current state; write them, mean and observations to `step` (`RolloutBuffer.at`)."""
-        sample_action(self.env.obs, self._critic_obs, step, self._actor, self._scaling)
+        sample_action(self.env.obs, self._critic_obs, step, self._model, self._scaling)
 
     def _record_step(self, step: RolloutBuffer) -> None:
         """Write the environment's last reward, end and final observation to `step` (`RolloutBuffer.at`)."""
@@ -89,7 +88,7 @@ class Collector:
 
 
 def sample_action(
-    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, actor: ActorTensors, scaling: Scaling
+    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, model: ActorCritic, scaling: Scaling
 ) -> None:
     """Sample every world's action from the policy, and write it, its mean and the observations to `step`.
 
@@ -98,9 +97,9 @@ def sample_action(
     """
     step.obs.copy_(obs)
     step.critic_obs.copy_(critic_obs)
-    mean = actor.forward(scaling.features(obs, actor.layers.weights[0].shape[1])).mean
+    mean = model.mean(scaling.features(obs))
     step.mean.copy_(mean)
-    step.action.mul_(actor.log_std.exp()).add_(mean)
+    step.action.mul_(model.log_std.exp()).add_(mean)
 
 
 def record_transition(
