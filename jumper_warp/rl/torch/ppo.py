@@ -110,7 +110,9 @@ def optimiser_step(
     norms = clip_gradient(flat.gradient, flat.actor_size, cfg.max_grad_norm)
     optimiser.step()
     skipped = 1.0 - norms.isfinite().all().float()
-    parts = [part.detach() for part in losses[:4]]
-    step = StepStatistics(*parts, flat.kl.clone(), norms[0], norms[1], skipped)
+    surrogate = losses.surrogate.detach()
+    value = losses.value.detach()
+    entropy = losses.entropy.detach()
+    step = StepStatistics(surrogate, value, entropy, losses.asymmetry, flat.kl.clone(), norms[0], norms[1], skipped)
     sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(skipped)]), nan=0.0, posinf=0.0, neginf=0.0))
     return step
