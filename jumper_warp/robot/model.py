@@ -16,9 +16,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from jumper_warp.robot.checks import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH, check_gravity
+from jumper_warp.robot.legs import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_count
@@ -89,7 +89,6 @@ def build_model(
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
             unknown `ground`.
-        RobotDescriptionError: the default description cannot be read.
     """
     num_worlds = check_count("num_worlds", num_worlds)
     if not 0.0 <= friction <= MAX_FRICTION:

@@ -1,4 +1,4 @@
-"""Data classes of a robot description, and the error for a bad one."""
+"""Data classes of a robot description."""
 
 from __future__ import annotations
 
@@ -10,32 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.utils.errors import InputError
-
 LEGS = ("FL", "FR", "BL", "BR")  # Legs in the order of every array: front left, front right, back left, back right
 
 MOTOR_JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("lateral", "outer", "inner"))
 """The 12 motor joints in motor order: index 3 * leg + {0 lateral, 1 outer, 2 inner}."""
-
-
-class RobotDescriptionError(InputError):
-    """Error in a robot description. The message is one line: "FILE: PART: PROBLEM", without PART if it is empty."""
-
-    def __init__(self, file: Path, part: str, problem: str):
-        place = f"{file}: {part}" if part else f"{file}"
-        super().__init__(" ".join(f"{place}: {problem}".split()))
-
-
-def description_error(message: str) -> RobotDescriptionError:
-    """Return a RobotDescriptionError made from a message of the form "FILE: PROBLEM"."""
-    file, _, problem = message.partition(": ")
-    return RobotDescriptionError(Path(file), "", problem)
-
-
-def require(holds: bool, file: Path, part: str, problem: str) -> None:
-    """Raise RobotDescriptionError with a message that names file and part, unless `holds` is true."""
-    if not holds:
-        raise RobotDescriptionError(file, part, problem)
 
 
 @dataclass(frozen=True, eq=False)

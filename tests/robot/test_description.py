@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.robot.description import knee_angles, leg_dimensions, load_description
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, knee_angles, leg_dimensions, load_description
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +81,40 @@ def test_stops_of_lateral_outer_and_transversal_sum(description):
 
 def test_default_pose_has_transversals_at_45_degrees(description):
     assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
+
+
+@pytest.mark.parametrize("leg", LEGS)
+def test_leg_mirrors_the_front_left_one_but_for_the_places_of_the_hips(description, leg):
+    flip = np.array([1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])  # signs of x, y, z
+    for link in (link for link in description.links if link.name.startswith(leg)):
+        twin = description.link(f"FL{link.name[2:]}")
+        assert (link.mass, len(link.collisions)) == (twin.mass, len(twin.collisions))
+        np.testing.assert_allclose(link.com, flip * twin.com, atol=1e-6)
+        np.testing.assert_allclose(link.inertia, np.outer(flip, flip) * twin.inertia, atol=1e-9)
+    for joint in (joint for joint in description.joints if joint.name.startswith(leg)):
+        twin = description.joint(f"FL{joint.name[2:]}")
+        origin = flip * twin.origin
+        if joint.name.endswith("lateral"):
+            origin[1] = flip[1] * abs(joint.origin[1])
+        np.testing.assert_allclose(joint.origin, origin, atol=1e-6)
+        np.testing.assert_allclose(np.abs(joint.axis), np.abs(twin.axis), atol=1e-6)
+        assert (joint.lower, joint.upper) == (twin.lower, twin.upper)
+    loop = description.loops[LEGS.index(leg)]
+    assert (loop.parent, loop.child) == (f"{leg}_inner_shank", f"{leg}_outer_shank")
+    paw = description.link(loop.parent).collisions[0]
+    for anchor in (loop.parent_anchor, loop.child_anchor, paw.position):
+        assert anchor.tolist() == [0.0, 0.0, -0.3]
+
+
+def test_inertia_tensors_are_those_of_mass_distributions(description):
+    for link in description.links:
+        low, middle, high = np.linalg.eigvalsh(link.inertia)
+        assert 0.0 < low and high <= (low + middle) * (1.0 + 1e-9)
+
+
+def test_limits_of_the_urdf_are_those_of_the_motors_and_poses_are_within_the_stops(description):
+    for name, motor in zip(MOTOR_JOINTS, description.motors, strict=True):
+        joint = description.joint(name)
+        assert (joint.effort, joint.velocity) == pytest.approx((motor.peak_torque, motor.no_load_speed), rel=1e-3)
+        assert all(joint.lower <= description.pose(pose)[MOTOR_JOINTS.index(name)] <= joint.upper
+                   for pose in description.poses)  # fmt: skip

@@ -1,0 +1,70 @@
+"""Dimensions of a leg, and knee angles that close its loop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumper_warp.robot.parts import LEGS, RobotDescription
+from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class LegDimensions:
+    """Lengths and positions that define one leg's geometry.
+
+    Housing frame: on the lateral axis, x forward, y left. Names are those of the kernels' `LegGeometry`.
+    """
+
+    hip: tuple[float, float, float]  # [m] lateral axis, body frame
+    front: float  # +1 front leg, -1 back leg
+    side: float  # +1 left leg, -1 right leg
+    outer_x: float  # [m] axis of the outer thigh, housing x
+    inner_x: float  # [m] axis of the inner thigh, housing x
+    plane_y: float  # [m] both thigh axes, housing y
+    knee_y: float  # [m] offset of knees, ankle and paw from the thigh plane, along housing y
+    thigh: float  # [m] thigh axis to knee
+    shank: float  # [m] knee to ankle
+    paw_radius: float  # [m] sphere centred at the ankle
+
+
+def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
+    """Return the dimensions of one leg ("FL", "FR", "BL" or "BR"), from the origins of its joints."""
+    lateral, outer, inner = (description.joint(f"{leg}_{name}").origin for name in ("lateral", "outer", "inner"))
+    knee = description.joint(f"{leg}_outer_knee").origin
+    return LegDimensions(
+        hip=(float(lateral[0]), float(lateral[1]), float(lateral[2])),
+        front=math.copysign(1.0, lateral[0]),
+        side=math.copysign(1.0, lateral[1]),
+        outer_x=float(outer[0]),
+        inner_x=float(inner[0]),
+        plane_y=float(outer[1]),
+        knee_y=float(knee[1]),
+        thigh=-float(knee[2]),
+        shank=-float(description.loops[LEGS.index(leg)].parent_anchor[2]),
+        paw_radius=description.link(f"{leg}_inner_shank").collisions[0].size[0],
+    )
+
+
+def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, float, float]:
+    """Return the outer and inner knee angles [rad] that close a leg's loop at given thigh angles, and ankle z [m].
+
+    outer, inner: thigh angles [rad]. The ankle is the lower intersection of two circles of radius `shank` about the
+    knees. z, and points (x, z) [m] below, are in the housing frame (see `LegDimensions`). Raises InputError where the
+    circles do not intersect.
+    """
+    outer_knee = np.array([leg.outer_x + leg.front * leg.thigh * math.sin(outer), -leg.thigh * math.cos(outer)])
+    inner_knee = np.array([leg.inner_x - leg.front * leg.thigh * math.sin(inner), -leg.thigh * math.cos(inner)])
+    span = outer_knee - inner_knee
+    distance = math.hypot(*span)
+    if not 1.0e-6 < distance < 2.0 * leg.shank:
+        raise InputError(f"two shanks of {leg.shank} m cannot connect knees {distance:.4f} m apart")
+    rise = math.sqrt(leg.shank**2 - 0.25 * distance**2) / distance
+    ankle = 0.5 * (outer_knee + inner_knee) + leg.front * rise * np.array([span[1], -span[0]])
+    # tilt of each shank from -z toward +front
+    outer_tilt, inner_tilt = (
+        math.atan2(leg.front * (ankle - knee)[0], -(ankle - knee)[1]) for knee in (outer_knee, inner_knee)
+    )
+    return outer - outer_tilt, inner + inner_tilt, float(ankle[1])
