@@ -4,7 +4,7 @@
 
 Speeds are policy steps per second of all environments together. A policy step is 8 physics steps of 1/480 s, motors
 included. Both solvers replay a captured graph. The outcome is checked before the timing: the robots must stand, or
-reach their apex. `--baseline PATH` also runs the script of another checkout and reports the speed ratio. `--threads 1
+reach their apex. `--threads 1
 2` compares numbers of CPU threads, for physics and for whole environments; all other metrics are measured with the last
 number.
 """
@@ -12,7 +12,6 @@ number.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import warp as wp
 
@@ -20,10 +19,8 @@ from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
-from jumper_warp.utils.threads import checked_threads
 from support.scripts import DeviceArgs, report, run_script
 from support.speed import time_solver, time_threads
-from support.timing import baseline_ratios
 
 
 @dataclass(frozen=True)
@@ -34,12 +31,7 @@ class Args(DeviceArgs):
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
     repeats: int = 5  # Number of timed repetitions; the median is reported
     steps: int = 100  # Number of policy steps in a repetition of the standing test
-    baseline: Path | None = None  # Root of another checkout to compare with
     threads: list[int] | None = None  # Numbers of CPU threads to compare (default: all cores, nothing is compared)
-
-    def __post_init__(self) -> None:
-        for threads in self.threads or []:
-            checked_threads(threads)
 
 
 def main(args: Args) -> dict:
@@ -61,7 +53,7 @@ def main(args: Args) -> dict:
             metrics |= time_threads(envs, args.threads, args.steps, args.repeats)
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
-    values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
+    values["envs"] = args.envs
     names = [f"{s}_steps_per_s_{phase}" for phase in ("standing", "jump") for s in args.solvers]
     keys = [key for key in values if key.endswith((*names, "ratio_standing", "ratio_jump", "thread_speedup"))]
     return report(args, folder, values, f"Policy steps per second, {values['device']}", keys)

@@ -8,23 +8,19 @@ trains on the same environment through the package's adapter. Outcomes are check
 
 `--variants eager` also times PPO without the fused kernels, `--variants all` all variants of `support.variants`.
 `--only-ppo` times PPO and its variants only.
-`--baseline PATH` also runs the script of another checkout and reports the speed ratio.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import warp as wp
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from support.scripts import ThreadArgs, report, run_script
 from support.speed import time_parts, time_ppo, time_rsl_rl
-from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
 
 
@@ -43,14 +39,6 @@ class Args(ThreadArgs):
     num_steps: int = 32  # Policy steps of each environment in an iteration
     variants: tuple[str, ...] = ()  # Names of further timed variants of PPO (`support.variants`), or all
     only_ppo: bool = False  # Time PPO and its variants only
-    baseline: Path | None = None  # Root of another checkout to compare with
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "repeats", "iterations", "num_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in self.names():
-            variant(PpoCfg(), name)
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the trainer's variants to time."""
@@ -78,7 +66,6 @@ def main(args: Args) -> dict:
     if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
-    values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
     keys = [f"{part}_steps_per_s_{train_envs}" for part in ("solver", "env")]
     keys += ["ppo_steps_per_s", "ppo_collect_s", "ppo_update_s", "rsl_rl_steps_per_s", "ppo_over_rsl_rl"]
     return report(args, folder, values, f"Training with {train_envs:,} environments, {info.name}", keys)

@@ -323,8 +323,6 @@ class Args(ThreadArgs):
         unknown = set(self.only) - {BASELINE, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
-        if self.length < 1 or self.num_envs < 1 or min(self.num_jumps) < 1 or self.num_squats < 1:
-            raise InputError("iterations, num_envs, num_jumps and num_squats must be at least 1")
 
     @property
     def length(self) -> int:

@@ -22,7 +22,6 @@ from jumper_warp.robot.model import MOTOR_DOFS, build_model
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.pinocchio_model import build_pinocchio
@@ -177,10 +176,6 @@ class Args(OutputArgs):
     robot: Path | None = None  # Robot overlay (docs/reference/overlays.md; default: the robot as described)
     states: int = 200  # Number of random states
     seed: int = 0  # Seed of the states
-
-    def __post_init__(self) -> None:
-        if self.states < 1:
-            raise InputError(f"states must be at least 1, got {self.states}")
 
 
 def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float]:

@@ -353,11 +353,6 @@ class Args(EvaluationArgs):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_flights < 1 or not 0.0 <= self.max_leg_delay <= 100.0:
-            values = f"{self.num_flights}, {self.max_leg_delay}"
-            raise InputError(f"need at least one flight, and max_leg_delay in 0 to 100 ms, got {values}")
-        if not 0.3 <= self.height_range[0] <= self.height_range[1] <= 10.0:
-            raise InputError(f"height_range must be in 0.3 to 10 m and rise, got {self.height_range}")
         if self.takeoff == "policy" and not self.landing_policy:
             raise InputError("takeoff by a policy needs one: --landing-policy")
 

@@ -50,10 +50,6 @@ class Args(DeviceArgs):
     hidden: tuple[int, ...] = (256, 128, 128)  # Widths of the hidden layers
     calls: int = 20  # Number of calls in a repetition of a timing; the median of five repetitions is reported
 
-    def __post_init__(self) -> None:
-        if min(self.num_envs, self.num_steps, self.epochs, self.calls) < 1:
-            raise InputError("num_envs, num_steps, epochs and calls must be at least 1")
-
 
 class RandomEnv:
     """A `VecEnv` with random observations and rewards; with `still` they are constant, so that a step costs nothing."""

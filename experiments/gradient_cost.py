@@ -22,7 +22,6 @@ from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
 from jumper_warp.sim.dynamics import TOLERANCE
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.gradients import PUSH, TICKS, schedule, start
@@ -118,10 +117,6 @@ class Args(DeviceArgs):
     repeats: int = 7
     """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each counts."""
     double: bool = False  # Whether to compute in double precision
-
-    def __post_init__(self) -> None:
-        if self.repeats < 1 or (self.num_envs is not None and self.num_envs < 1):
-            raise InputError("num_envs and repeats must be at least 1")
 
 
 def main(args: Args) -> dict:

@@ -9,15 +9,13 @@ more than 5 standard deviations. `accepted_bad_expected` is the expected number 
 all of these ended in the right minimum.
 
 `evaluation.jsonl` in the folder has one line for each fit. A later run with the same `--out` computes only the missing
-ones. `--shard 1/3` computes every third one, in a folder of its own; a run without `--shard` in a folder with the
-lines of all shards computes the metrics.
+ones.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -33,7 +31,6 @@ from jumper_warp.identification.parameters import ParameterSet, jumper_parameter
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.results import CONFIDENCE, Identification
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.progress import phase
@@ -142,14 +139,6 @@ class Args(OutputArgs):
     num_noises: int = 3  # Number of recordings of each robot
     stream: Stream = "evaluation"  # Random numbers of robots, motions and noise; streams have none in common
     workers: int = 1  # Number of processes, each on one CPU core
-    shard: str = "1/1"  # Part of the fits to compute, such as 2/3
-
-    def __post_init__(self) -> None:
-        numbers = re.fullmatch(r"([1-9]\d{0,3})/([1-9]\d{0,3})", self.shard)
-        if min(self.num_robots, self.num_noises, self.workers) < 1:
-            raise InputError("num_robots, num_noises and workers must be at least 1")
-        if not numbers or int(numbers[1]) > int(numbers[2]):
-            raise InputError(f"shard must be K/N with K in 1 to N, such as 2/3, got {self.shard:.20}")
 
 
 def saved_fits(path: Path) -> dict[tuple[int, int], Json]:
@@ -197,9 +186,8 @@ def main(args: Args) -> Json:
     path = folder / f"{args.stream}.jsonl"
     fits = saved_fits(path)
     write_atomically(path, "".join(json.dumps(fit) + "\n" for fit in fits.values()).encode())
-    shard, shards = map(int, args.shard.split("/"))
     every = [(robot, noise) for robot in range(args.num_robots) for noise in range(args.num_noises)]
-    missing = [key for key in every[shard - 1 :: shards] if key not in fits]
+    missing = [key for key in every if key not in fits]
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # of the processes, which inherit them
         os.environ[name] = "1"
     with (

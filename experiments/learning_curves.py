@@ -24,7 +24,6 @@ import warp as wp
 
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_RANGES, LearningCurve, compare, curve_metrics, plot_curves, train_and_time
@@ -50,18 +49,6 @@ class Args(DeviceArgs):
     history: int | None = None
     """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
     randomize: bool = False  # Train with randomisation and noise
-
-    def __post_init__(self) -> None:
-        if (kind := make_task(self.task).evaluation.kind) not in TEST_RANGES:
-            raise InputError(f"{self.task} is no jump: its evaluation is {kind}")
-        for name in self.variants:
-            variant(trainer_settings(self.task), name)
-        if not self.variants or not self.seeds or min(self.seeds) < 0:
-            raise InputError("at least one variant and one seed of 0 or more are needed")
-        if self.seconds <= 0.0 or self.eval_interval <= 0.0:
-            raise InputError(f"seconds and eval_interval must be positive, got {self.seconds} and {self.eval_interval}")
-        if self.iterations < 0 or self.workers < 1 or (self.workers > 1 and not self.iterations):
-            raise InputError(f"need workers >= 1, and iterations for more than one, got {self.workers}")
 
 
 def train(args: Args, name: str, seed: int) -> LearningCurve:

@@ -24,7 +24,6 @@ from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, ver
 from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
@@ -101,12 +100,6 @@ class Args(DeviceArgs):
     gravity: float = EARTH  # [m/s^2] Downward
     filter: Literal["both", "stock", "loose"] = "both"
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
-
-    def __post_init__(self) -> None:
-        if not self.stiffness or not self.squat_angles:
-            raise InputError("need at least one stiffness and one squat")
-        for stiffness in self.stiffness:
-            with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
         """Return the jumps with knee springs for these flags and the command filter `name`, a key of FILTERS."""

@@ -117,13 +117,6 @@ class Args(ThreadArgs):
     save_to_policies: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write the rows in `out` into metrics.json of the policies' folders; nothing is measured."""
 
-    def __post_init__(self) -> None:
-        for names, known in ((self.policies, (*policy_tasks(), COMBINED)), (self.conditions, (*CONDITIONS, *TESTS))):
-            if unknown := sorted(set(names) - set(known)):
-                raise InputError(f"no {unknown[0]!r:.40}; there are {', '.join(known)}")
-        if not self.seeds or self.trials < 16:
-            raise InputError(f"need a seed and at least 16 trials, got {self.seeds} and {self.trials}")
-
     def row(self, policy: str, condition: str, seed: int) -> Path:
         """Return the folder with the results of a policy in one condition with one seed (a row)."""
         return self.out / policy / f"{condition}-{seed}"

@@ -39,7 +39,6 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.training import train
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, measure
 from jumper_warp.utils.output import read_values, write_metrics
@@ -270,12 +269,6 @@ class Args(ThreadArgs):
     save_interval: int = 100  # Number of iterations between two points of the learning curve
     train_flags: str = ""  # More flags of `jumper train`: --train-flags="--max-iterations 10 --num-envs 64"
     table: bool = False  # Print the table and plot the curves of --out, and train nothing
-
-    def __post_init__(self) -> None:
-        if unknown := set(self.arms) - set(ARMS):
-            raise InputError(f"arms are {', '.join(ARMS)}, not {min(unknown)}")
-        if self.num_jumps < 1 or self.save_interval < 1 or min(self.seeds, default=0) < 0:
-            raise InputError("num_jumps and save_interval must be at least 1, seeds at least 0")
 
     def trainings(self) -> Iterator[tuple[str, str, int]]:
         """Yield (task, ablation or "full", seed) of each training: all trainings with the first seed, then the next."""

@@ -57,7 +57,6 @@ from jumper_warp.trajectory.augmented_lagrangian import Progress, minimise
 from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
 from jumper_warp.utils.arrays import write_npz
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
@@ -468,15 +467,6 @@ class Args(ThreadArgs):
     effort: float = 1.0  # [1] Factor on the number of iterations
     final_iterations: int | None = None  # Iterations of the last descent (default: those of each jump)
     seed: int = 0  # Seed of random candidates and displacements
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.jumps if name not in ALL_JUMPS]
-        if unknown or not self.jumps:
-            raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(ALL_JUMPS)}")
-        if not self.effort > 0.0 or (self.final_iterations is not None and self.final_iterations < 1):
-            raise InputError("need an iteration of the last descent, and an effort above 0")
-        if self.samples is not None and self.samples < 48:
-            raise InputError(f"need at least 48 samples, got {self.samples}")
 
 
 def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -> tuple[dict[str, float], MotionReplay]:

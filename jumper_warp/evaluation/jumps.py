@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, check, listed
-from jumper_warp.kernels.jump.terminations import second_takeoff
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.evaluation import with_jump_terminations
-from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.rotations import turn_plane, yaw_of
@@ -30,16 +26,6 @@ REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
 NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because an earlier jump failed
-
-
-def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of a task that also ends evaluated jumps, as failures, when the robot takes off a second time.
-
-    This is the rule of the paper's authors.
-    """
-    task = with_jump_terminations(task)
-    takeoff = TerminationTerm(second_takeoff, speed=TAKEOFF_SPEED)
-    return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 def random_headings(count: int, seed: int) -> np.ndarray:

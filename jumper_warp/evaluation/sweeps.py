@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, HeightFlags, LandingFlags
-from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, JumpLog, random_headings, with_second_takeoff
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, JumpLog, random_headings
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import check, within
 from jumper_warp.evaluation.run import HEADLINES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation, with_jump_terminations
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
@@ -104,14 +103,14 @@ class Sweep(Suite):
         log.rest = self.rest_time
         return run.run_episodes(env, log, film=film)
 
-    def pushed_in_flight(self, run: EvaluationRun, change: Callable[[TaskCfg], TaskCfg]) -> Metrics:
+    def pushed_in_flight(self, run: EvaluationRun) -> Metrics:
         """Repeat the sweep with robots that are pushed in flight, and return its metrics as `pushed_in_flight_<key>`.
 
-        Empty for nominal robots, and if the test itself pushes in flight. change: see `EvaluationRun.env`.
+        Empty for nominal robots, and if the test itself pushes in flight.
         """
         if not self.randomize or self.push_in_flight:
             return {}
-        env = run.env(self.num_jumps, change, replace(run.conditions, push_in_flight=True))
+        env = run.env(self.num_jumps, conditions=replace(run.conditions, push_in_flight=True))
         values = self.flags.metrics(self.run_sweep(run, env))
         pushed = {
             key: values[key]._replace(over=f"{values[key].over} of robots pushed in flight") for key in self.pushed
@@ -174,7 +173,7 @@ class HeightSweep(Sweep):
         )
         inside = within(jumps.goals[..., 2], self.flags.success_range)
         values = limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
-        return self.flags.metrics(jumps) | values | self.pushed_in_flight(run, with_jump_terminations)
+        return self.flags.metrics(jumps) | values | self.pushed_in_flight(run)
 
 
 @dataclass(frozen=True)
@@ -190,8 +189,6 @@ class DistanceSweep(Sweep):
 
     distance_range: tuple[float, float] = (0.3, 1.5)  # [m] Distance of the nearest and of the farthest goal
     max_lateral_offset: float = 0.0  # [m] Largest offset of a goal to either side; offsets are sampled
-    end_at_second_takeoff: bool = False
-    """Whether a second takeoff after landing ends a jump as a failure, as in the authors' configuration."""
     num_recorded: int = 5
 
     name: ClassVar = "range"
@@ -222,9 +219,7 @@ class DistanceSweep(Sweep):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot reached over commanded distance, and return the metrics."""
-        run.settings["end_at_second_takeoff"] = self.end_at_second_takeoff
-        change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
-        landings = self.run_sweep(run, run.env(self.num_jumps, change), "jumps")
+        landings = self.run_sweep(run, run.env(self.num_jumps), "jumps")
         trained = trained_range(run.task)["trained_range_m"]
         plot_sweep(
             run.folder / "sweep.png",
@@ -239,4 +234,4 @@ class DistanceSweep(Sweep):
             title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )
-        return self.metrics(landings) | self.pushed_in_flight(run, change)
+        return self.metrics(landings) | self.pushed_in_flight(run)

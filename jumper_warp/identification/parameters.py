@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -135,16 +134,6 @@ class ParameterSet:
                 f"unknown parameter {min(left_out - known)!r:.60} to exclude; expected one of {', '.join(self.names)}"
             )
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
-
-    def changed(self, **changes: dict) -> ParameterSet:
-        """Return the parameter set with some fields replaced, by parameter name: `latency={"prior": 0.001}`.
-
-        Raises InputError: an unknown name, or fields as in `Parameter`.
-        """
-        unknown = set(changes) - set(self.names)
-        if unknown:
-            raise InputError(f"unknown parameter {min(unknown)!r}; expected one of {', '.join(self.names)}")
-        return ParameterSet(tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in self.parameters))
 
 
 def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:

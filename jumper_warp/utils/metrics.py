@@ -1,17 +1,13 @@
-"""Definitions of metrics, their values with 95 % confidence intervals, and printed tables of them."""
+"""Definitions of metrics, and their values with 95 % confidence intervals."""
 
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.table import Column, Table
-
-from jumper_warp.utils.tables import WIDTH, print_table
 
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
@@ -149,40 +145,6 @@ def resampled_means(rows: np.ndarray) -> np.ndarray:
     at_once = max(1, min(RESAMPLES, BATCH // n))
     sizes = [min(at_once, RESAMPLES - done) for done in range(0, RESAMPLES, at_once)]
     return np.concatenate([rows[rng.integers(0, n, (size, n))].mean(axis=1) for size in sizes])
-
-
-def print_metrics(
-    metrics: AnyMetrics,
-    paper: Mapping[str, float] | None = None,
-    conditions: Mapping[str, Any] | None = None,
-    title: str = "",
-) -> None:
-    """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line."""
-    conditions = conditions or {}
-    lists = {}
-    table = Table(
-        Column("metric", overflow="fold"),
-        "value",
-        "95 % interval",
-        *(["paper"] if paper else []),
-        box=None,
-        pad_edge=False,
-    )
-    for key, entry in metrics.items():
-        value, _, interval, _ = entry if isinstance(entry, MetricValue) else MetricValue(entry)
-        if isinstance(value, list):
-            lists[key] = value
-        else:
-            limits = "" if interval is None else "{:.4g} to {:.4g}".format(*interval)
-            known = [f"{paper[key]:g}" if key in paper else ""] if paper else []
-            table.add_row(key, format_value(value), limits, *known)
-    text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
-    for line in (title, text):
-        if line:
-            print(textwrap.fill(line, WIDTH))
-    print_table(table)
-    for key, value in lists.items():
-        print(textwrap.fill(f"{key}: {format_value(value)}", WIDTH))
 
 
 def format_value(value: Any) -> str:

@@ -14,7 +14,7 @@ import tyro
 from rich.table import Column, Table
 
 from jumper_warp.utils.files import json_bytes
-from jumper_warp.utils.metrics import MetricValue, format_value, print_metrics, split_unit
+from jumper_warp.utils.metrics import MetricValue, format_value, split_unit
 from jumper_warp.utils.output import Report
 from jumper_warp.utils.tables import WIDTH, print_table
 
@@ -58,15 +58,16 @@ def print_summary(
         return
     metrics = report.metrics
     folder = report.path.parent
-    main = {key: metrics[key] for key in keys if key in metrics}
+    main = metrics if flags.verbose else {key: metrics[key] for key in keys if key in metrics}
     print(textwrap.fill(title, WIDTH))
-    if flags.verbose:
-        print_metrics(metrics, paper, report.conditions)
-    elif main:
+    if flags.verbose and report.conditions:
+        conditions = (f"{name} {format_value(value)}" for name, value in report.conditions.items())
+        print(textwrap.fill("; ".join(conditions), WIDTH))
+    if main:
         table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
         print_table(table)
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
-    hints += [f"--verbose prints {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
+    hints += [f"--verbose prints {len(metrics)} metrics"] if len(metrics) > len(main) else []
     end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
     print(*_file_lines(folder, list(films)), f"{'metrics':9}  {report.path}", end, sep="\n")
 

@@ -165,12 +165,6 @@ class Recorder:
         """Write the recording as a file of the Rerun viewer; return its path."""
         return write_rrd(self.recording(), Path(path))
 
-    def save_film(self, path: Path, **options: Any) -> Path:
-        """Write the recording as a film (.mp4, .webp or .gif); return its path; options: those of `write_film`."""
-        from jumper_warp.viz.film import write_film
-
-        return write_film(self.recording(), Path(path), **options)
-
     def save_picture(self, path: Path, **options: Any) -> Path:
         """Write a composite picture (.png, .webp or .jpg); return its path; options: those of `write_picture`."""
         from jumper_warp.viz.picture import write_picture

@@ -8,7 +8,7 @@ import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff
+from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.policy import save_policy
@@ -32,12 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("horizontal-jump", with_jump_terminations),
-        ("horizontal-jump", with_second_takeoff),
-        ("vertical-jump", with_jump_terminations),
-    ],
+    ("name", "change"), [("horizontal-jump", with_jump_terminations), ("vertical-jump", with_jump_terminations)]
 )
 def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
     env = make_env(2, task=change(make_task(name)), auto_reset=False)
@@ -46,19 +41,6 @@ def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
     edit_coordinates(env, 1, q={2: 0.05})
     env.step(torch.zeros((2, 12)))
     assert ending_names(env) == ["success", "low_base"]
-
-
-def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
-    names = {}
-    for change in (with_jump_terminations, with_second_takeoff):
-        env = make_env(2, task=change(JUMP), auto_reset=False)
-        env.evaluation_reset(np.zeros((2, 4)))
-        edit_episodes(env, phase=LANDED, phase_steps=5)
-        for world, up in ((0, 0.5), (1, 0.2)):  # [m/s] upward speed after the step; limit: 0.25
-            edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
-        env.step(torch.zeros((2, 12)))
-        names[change.__name__] = ending_names(env)
-    assert names == {"with_jump_terminations": ["", ""], "with_second_takeoff": ["second_takeoff", ""]}
 
 
 # ---------------------------------------------------------------- pushes

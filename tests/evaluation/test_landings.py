@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import JumpLog, with_second_takeoff, wrapped
+from jumper_warp.evaluation.jumps import JumpLog, wrapped
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
@@ -330,8 +330,6 @@ def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():
 def test_landing_evaluation_excludes_shaping_terminations():
     terms = with_jump_terminations(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms] == ["diverged", "low_base", "collided", "no_jump", "success"]
-    terms = with_second_takeoff(make_task("horizontal-jump")).terminations
-    assert [term.name for term in terms][-2:] == ["second_takeoff", "success"]
 
 
 @pytest.mark.parametrize(

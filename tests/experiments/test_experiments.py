@@ -1,6 +1,4 @@
 import json
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
 from metric_helpers import values
 from support.learning import LearningCurve, run_jumps
-from support.timing import baseline_ratios, changed_flags
 
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -199,34 +196,6 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert sum(values[f"{part}_share"] for part in parts) == pytest.approx(1.0)
     assert all(values[f"{part}_us"] > 0.0 for part in parts)
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
-
-
-@dataclass
-class Flags:
-    """Flags of a script."""
-
-    envs: tuple
-    noise: bool
-    baseline: Path | None = None
-    out: Path | None = None
-    device: str | None = None
-    newest: int = 3
-
-
-def test_baseline_ratios_compare_rates_with_those_of_another_checkout_with_the_same_flags(tmp_path):
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments/script.py").write_text(
-        "import sys\n"
-        "assert sys.argv[1:6] == ['--envs', '4', '8', '--no-noise', '--out'], sys.argv\n"
-        "from pathlib import Path\n"
-        "from jumper_warp.utils.output import write_metrics\n"
-        "write_metrics(Path(sys.argv[6]), {'steps_per_s_jump': 50.0, 'apex_m': 1.0})"
-    )
-    metrics = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
-    flags = Flags((4, 8), False, tmp_path)
-    assert baseline_ratios(tmp_path, "experiments/script.py", flags, metrics) == {"steps_per_s_jump_over_baseline": 2.0}
-    assert baseline_ratios(None, "experiments/script.py", flags, metrics) == {}
-    assert changed_flags(Flags((4,), True, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
 
 
 def test_solver_benchmark_reports_both_solvers_and_ratio(tmp_path):

@@ -1,4 +1,4 @@
-"""Intervals of metrics against SciPy, and the printed table."""
+"""Intervals of metrics against SciPy."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jumper_warp.utils.metrics import Metric, MetricValue, largest, mean, measure, print_metrics, rate, rmse
+from jumper_warp.utils.metrics import Metric, MetricValue, largest, mean, measure, rate, rmse
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 7), (3, 7), (7, 7), (4000, 4096)])
@@ -44,10 +44,3 @@ def test_measure_takes_trials_of_the_set_and_of_the_mask():
     rows = [Metric("tilt_max_deg", largest, "landed jumps", lambda o: o.tilt)]
     metrics = measure(rows, outcome, np.array([True, False, True, True]), "near_", "to near goals")
     assert metrics == {"near_tilt_max_deg": MetricValue(3.0, 2, None, "landed jumps to near goals")}
-
-
-def test_printed_table_has_at_most_80_columns_and_the_papers_values(capsys):
-    metrics = {"a_long_name_of_a_metric_of_some_jumps_m": mean(np.arange(9.0)), "bin_m": MetricValue([1.0] * 40)}
-    print_metrics(metrics, {"a_long_name_of_a_metric_of_some_jumps_m": 0.026}, {"solver": "x" * 70, "seed": 0}, "title")
-    out = capsys.readouterr().out
-    assert max(map(len, out.splitlines())) <= 80 and "0.026" in out and "bin_m: 1, 1, " in out
