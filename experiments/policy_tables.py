@@ -2,21 +2,17 @@
 
     python experiments/policy_tables.py
 
-A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`,
-`choice` or `seeds`. `policy_pages.toml` defines columns and tests.
+A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`
+or `choice`. `policy_pages.toml` defines columns and tests.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import scipy.stats
 
 from jumper_warp.evaluation.attitude import TURN_METRICS
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS, PLACE_METRICS
@@ -25,7 +21,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
-from jumper_warp.utils.metrics import MetricValue, Z, unit_of
+from jumper_warp.utils.metrics import MetricValue, unit_of
 from support.policy_results import CONDITIONS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
 from support.scripts import run_script
 
@@ -38,8 +34,6 @@ SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
 """Words for `Evaluation.paper` by `Evaluation.kind`."""
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
 KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
-LEAST = 20  # Least number of trials of a metric that is compared between seeds
-LEVEL = 0.01  # [1] Level of significance after correction
 POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
 RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else success_rate
 ERRORS = {
@@ -226,56 +220,6 @@ def _success(row: Row, kind: str) -> str:
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
 
 
-def difference_p(key: str, a: MetricValue, b: MetricValue) -> float:
-    """Return the two-sided p-value of the hypothesis that two rates or two means are equal.
-
-    Rates are compared by the two-proportion test with pooled variance, means by Welch's t-test, whose standard errors
-    follow from the 95 % intervals.
-    """
-    counts = [int(x.trials or 0) for x in (a, b)]
-    values = [float(x.value) for x in (a, b)]  # pyright: ignore[reportArgumentType]
-    if key.endswith("_rate"):
-        table = [[value * n, (1.0 - value) * n] for value, n in zip(values, counts, strict=True)]
-        if 0.0 in np.sum(table, axis=0):  # all true or all false
-            return 1.0
-        _, p, *_ = scipy.stats.chi2_contingency(table, correction=False)
-        return float(p)  # pyright: ignore[reportArgumentType]
-    stds = [math.sqrt(n) * np.ptp(x.interval or 0.0) / (2.0 * Z) for x, n in zip((a, b), counts, strict=True)]
-    if not any(stds):
-        return 1.0 if values[0] == values[1] else 0.0
-    samples = [x for sample in zip(values, stds, counts, strict=True) for x in sample]
-    return float(scipy.stats.ttest_ind_from_stats(*samples, equal_var=False).pvalue)
-
-
-def seed_tests(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
-    """Return the p-value of the difference of each metric between the first two seeds, by policy, condition and key.
-
-    Metrics without an interval or with fewer than LEAST trials are left out.
-    """
-    pairs: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        pairs.setdefault(row[:2], []).append(row)
-    tests = {}
-    for (policy, condition), (first, *others) in pairs.items():
-        for key, a in first.metrics.items() if others else ():
-            b = others[0].metrics.get(key, MetricValue(None))
-            if a.interval and b.interval and min(a.trials or 0, b.trials or 0) >= LEAST:
-                tests[policy, condition, key] = difference_p(key, a, b)
-    return tests
-
-
-def seed_section(rows: Sequence[Row]) -> str:
-    """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
-    tests = seed_tests(rows)
-    compared = len({names[:2] for names in tests})
-    significant = [f"- {', '.join(names)}: p = {p:.2g}\n" for names, p in tests.items() if p * len(tests) < LEVEL]
-    return (
-        f"{compared} rows were measured with two seeds. Each of their {len(tests):,} rates and means was compared:\n"
-        "rates by two-proportion tests, means by Welch's t-tests.\n"
-        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}).\n"
-    ) + "".join(significant)
-
-
 def pages() -> list[Path]:
     """Return the paths of the documentation pages and policies' READMEs that may have generated tables."""
     return [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "reference/metrics.md",
@@ -293,8 +237,6 @@ def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
         return key_table(subject)
     if name == "choice":
         return choice_table(tasks)
-    if name == "seeds":
-        return seed_section([row for policy in tasks for row in saved_rows(policy)])
     raise InputError(f"no table {name!r:.40}")
 
 

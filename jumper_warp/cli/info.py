@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from jumper_warp.cli.list import describe, size_text
 from jumper_warp.cli.main import parse
 from jumper_warp.utils.files import Json
-from jumper_warp.utils.tables import WIDTH
+from jumper_warp.utils.tables import WIDTH, table_lines
 
 if TYPE_CHECKING:
     from jumper_warp.policies.catalog import PolicySummary
@@ -26,22 +26,14 @@ INDENT = 14  # Characters before the values of a list of properties
 UNBROKEN = "\N{NO-BREAK SPACE}"  # Printed as a space
 
 
-class Column(NamedTuple):
-    """Column of the table of results that `jumper info` prints for a policy."""
-
-    title: str
-    key: str  # Of the metric in metrics.json
-
-
-COLUMNS = (
-    Column("success", "success_rate"), Column("settled", "settled_without_collision_rate"),
-    Column("landed", "landed_rate"), Column("apex error", "apex_error_abs_mean_m"),
-    Column("error at rest", "goal_distance_at_rest_mean_m"), Column("RMSE ahead", "settled_rmse_vx_m_s"),
-    Column("to the side", "settled_rmse_vy_m_s"), Column("turning", "settled_rmse_yaw_rate_rad_s"),
-    Column("settling time", "settling_time_mean_s"), Column("error at end", "error_at_end_mean_deg"),
-    Column("falls", "fall_rate"),
-)  # fmt: skip
-"""Columns of a policy's table; those whose metrics it lacks are left out."""
+COLUMNS = {
+    "success": "success_rate", "settled": "settled_without_collision_rate", "landed": "landed_rate",
+    "apex error": "apex_error_abs_mean_m", "error at rest": "goal_distance_at_rest_mean_m",
+    "RMSE ahead": "settled_rmse_vx_m_s", "to the side": "settled_rmse_vy_m_s",
+    "turning": "settled_rmse_yaw_rate_rad_s", "settling time": "settling_time_mean_s",
+    "error at end": "error_at_end_mean_deg", "falls": "fall_rate",
+}  # fmt: skip
+"""Columns of a policy's table: metric by title; those whose metrics it lacks are left out."""
 
 
 @dataclass(frozen=True)
@@ -110,23 +102,18 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     rows = [row for row in rows if row["conditions"].get("commands") == commands]
     first = {row["condition"]: row for row in reversed(rows)}
     shown = [row for row in rows if first[row["condition"]] is row]
-    columns = [column for column in COLUMNS if column.key in shown[0]["metrics"]]
-    lines = [["condition", *(column.title for column in columns)]]
+    from rich.table import Column, Table
+
+    columns = {title: key for title, key in COLUMNS.items() if key in shown[0]["metrics"]}
+    table = Table("condition", *(Column(title, justify="right") for title in columns), box=None, pad_edge=False)
     for row in shown:
-        words = row["condition"].replace("_", " ")
-        lines.append([words, *(_cell(column.key, row["metrics"].get(column.key)) for column in columns)])
-    widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
-    text = [
-        "  ".join(
-            [line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))]
-        )
-        for line in lines
-    ]
+        cells = (_cell(key, row["metrics"].get(key)) for key in columns.values())
+        table.add_row(row["condition"].replace("_", " "), *cells)
     trials = max(metric["trials"] or 0 for metric in shown[0]["metrics"].values())
     notes = [f"{trials:,} trials a line" + (f"; commands: {commands}" if commands else "")]
     if any("mujoco" in row["condition"] for row in shown):
         notes.append("mujoco: on Newton's SolverMuJoCo; all others on SolverJumper")
-    return [*text, *notes]
+    return [*table_lines(table), *notes]
 
 
 def _cell(key: str, metric: Mapping[str, Any] | None) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, HeightFlags, LandingFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags, LandingFlags
 from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, JumpLog, random_headings
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import check, within
@@ -18,7 +18,7 @@ from jumper_warp.evaluation.run import HEADLINES, EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, JumpEvaluation, PlaceEvaluation
 from jumper_warp.utils.files import Json
-from jumper_warp.utils.metrics import Metrics, chosen, measure
+from jumper_warp.utils.metrics import Metrics
 from jumper_warp.viz.plots import Published, plot_sweep
 
 if TYPE_CHECKING:
@@ -210,13 +210,6 @@ class DistanceSweep(Sweep):
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
-    def metrics(self, log: JumpLog) -> Metrics:
-        """Return the metrics of `jumper evaluate`, and the success rate over the distances of the paper's training."""
-        inside = within(log.goals[..., 0], PAPER_TRAINED)
-        success = chosen(PLACE_METRICS, "success_rate")
-        note = "over 0.4 to 1 m"
-        return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
-
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot reached over commanded distance, and return the metrics."""
         landings = self.run_sweep(run, run.env(self.num_jumps), "jumps")
@@ -234,4 +227,4 @@ class DistanceSweep(Sweep):
             title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )
-        return self.metrics(landings) | self.pushed_in_flight(run)
+        return self.flags.metrics(landings) | self.pushed_in_flight(run)

@@ -72,7 +72,7 @@ def check_function(
                 raise InputError(f"{place_of(func)}: {where}: argument {i} of {name} {found}")
     if not is_own(func):
         return
-    with explained(takes):
+    with explained():
         returned = _returned(func, tuple(takes), content_hash(func))
     if not may_return(returned):
         found = f"the function must return {returns}, it returns {shown_type(returned)}"
@@ -141,8 +141,7 @@ def check_values(where: str, settings: object, *args: float) -> None:
     if not isinstance(struct, Struct) or not callable(values):
         raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")
     if is_own(settings):
-        with explained([struct]):
-            made = values(*args)
+        made = values(*args)
         if getattr(made, "_cls", None) is not struct:
             found = f"must return {shown_type(struct)}, it returns {type(made).__name__}"
             raise InputError(f"{place_of(settings)}: {where}: values of {type(settings).__name__} {found}")

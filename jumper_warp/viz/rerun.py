@@ -50,9 +50,10 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
     """Write a recording atomically as a Rerun file (.rrd); return the path.
 
     Rerun collects it in memory: on a full disk its own writer would wait for ever.
-    Raises ImportError: rerun-sdk is not installed; OSError.
+    Raises OSError.
     """
-    rr = _import_rerun()
+    import rerun as rr
+
     stream = rr.RecordingStream("jumper-warp")
     memory = stream.memory_recording()
     writer = _Writer(rr, stream, recording)
@@ -64,15 +65,6 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
     writer.log_states()
     write_atomically(path, memory.drain_as_bytes())
     return path
-
-
-def _import_rerun() -> ModuleType:
-    """Return the Rerun module `rerun`. Raises ImportError, with the command that installs it."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise ImportError("writing .rrd files needs rerun: pip install rerun-sdk") from error
-    return rerun
 
 
 class _Writer:

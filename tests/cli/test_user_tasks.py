@@ -201,7 +201,7 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:7: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
-        ("tilt(robot)", "tilt(robot.quad)", "function level: RobotView has no field 'quad'; did you mean 'quat'?"),
+        ("tilt(robot)", "tilt(robot.quad)", "function level: `quad` is not an attribute of"),
         ("tilt(robot)", "tlt(robot)", "own_faults.py:{use}, function level: "),
         ('task, name="own', 'task, action_scale=15.0, name="own',
          "own_faults.py:{line}: own-faults: action_scale must be (float, float), got 15.0"),

@@ -1,4 +1,4 @@
-"""Conditions, tables and two seeds of the shipped policies, and the experiment at a tiny size."""
+"""Conditions and tables of the shipped policies, and the experiment at a tiny size."""
 
 import json
 import shutil
@@ -6,21 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
 
 from experiments import measure_policies
 from experiments.measure_policies import payload_overlay, run_test, with_trials
-from experiments.policy_tables import difference_p, filled, main_table, pages, seed_section, seed_tests
+from experiments.policy_tables import filled, main_table, pages
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.assets import POLICIES, policy_tasks
-from jumper_warp.utils.metrics import MetricValue, mean, rate
 from metric_helpers import saved_metrics
 from support import policy_results
-from support.policy_results import CONDITIONS, TESTS, Row, saved_rows, tasks_of, undefined
+from support.policy_results import CONDITIONS, TESTS, saved_rows, tasks_of, undefined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -54,45 +52,6 @@ def test_evaluations_have_at_least_the_requested_trials(policy, count):
     run = EvaluationRun(policy)
     flags = with_trials(default_flags(run.evaluation, "evaluate"), 300)
     assert flags.log(run.evaluation.prepare_task(run.task), 0).count == count
-
-
-# ---------------------------------------------------------------- two seeds
-
-
-def test_p_of_means_is_that_of_welchs_test_of_the_trials():
-    rng = np.random.default_rng(0)
-    samples = [rng.normal(0.0, 1.0, 40), rng.normal(0.6, 2.0, 30)]
-    errors = [1.959964 * x.std(ddof=1) / np.sqrt(len(x)) for x in samples]
-    metrics = [
-        MetricValue(x.mean(), len(x), (x.mean() - e, x.mean() + e)) for x, e in zip(samples, errors, strict=True)
-    ]
-    assert difference_p("mean", *metrics) == pytest.approx(scipy.stats.ttest_ind(*samples, equal_var=False).pvalue)
-    same = MetricValue(1.0, 50, (1.0, 1.0))
-    assert difference_p("mean", same, same) == 1.0
-    assert difference_p("mean", same, MetricValue(2.0, 50, (2.0, 2.0))) == 0.0
-
-
-def row(seed, successes, condition="nominal", trials=1000):
-    """Return a row with a rate, a mean that is the same for all seeds, and a largest value."""
-    metrics = {"success_rate": rate(np.arange(trials) < successes), "error_mean_m": mean(np.arange(trials)),
-               "error_max_m": MetricValue(float(seed), trials)}  # fmt: skip
-    return Row("vertical_jump", condition, seed, {}, metrics, {})
-
-
-def test_seeds_are_compared_by_all_metrics_with_an_interval_and_enough_trials():
-    rows = [row(0, 500), row(1, 580), row(0, 9, "mujoco"), row(0, 1, "randomised", 19), row(1, 18, "randomised", 19)]
-    tests = seed_tests(rows)
-    success, error = (("vertical_jump", "nominal", key) for key in ("success_rate", "error_mean_m"))
-    assert set(tests) == {success, error} and tests[error] == 1.0
-    assert tests[success] == pytest.approx(3.3e-4, rel=0.02)  # z = 0.08 / sqrt(2 * 0.54 * 0.46 / 1000) = 3.59
-
-
-def test_differences_are_significant_after_correction_for_the_number_of_tests():
-    assert "1 differences are significant" in seed_section([row(0, 500), row(1, 580)])
-    many = [row(seed, 500, condition) for condition in CONDITIONS for seed in (0, 1) if condition != "nominal"]
-    text = seed_section([row(0, 500), row(1, 565), *many])  # p = 0.0036, of 20 tests
-    assert "10 rows were measured with two seeds. Each of their 20 rates" in text
-    assert "0 differences are significant" in text
 
 
 # ---------------------------------------------------------------- tables of the pages
