@@ -231,22 +231,21 @@ def test_refuses_a_reading_that_is_not_finite_and_continues_with_the_next(value)
     np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"angle": np.degrees(np.tile([0.0, 0.8, 0.8], 4))}, r"angle must be within ±3.142 rad, got 45.84"),
-        ({"rate": np.full(12, 300.0)}, r"rate must be within ±100 rad/s, got 300"),
-        ({"height": 1e30}, r"height must be within ±10 m, got 1e\+30"),
-        ({"wanted_height": -500.0}, r"wanted_height must be within ±10 m, got -500"),
-        ({"jump_command": 2.0}, r"jump_command must be within ±1, got 2"),
-        ({"gravity": [0.0, 0.0, -9.81]}, "gravity must be a unit vector, got length 9.81"),
-        ({"gravity": np.zeros(3)}, "gravity must be a unit vector, got length 0"),
-    ],
-)
-def test_refuses_an_implausible_reading_and_keeps_the_history(change, message):
+WRONG_READINGS = [
+    ({"angle": np.degrees(np.tile([0.0, 0.8, 0.8], 4))}, r"angle must be within ±3.142 rad, got 45.84; hold the last"),
+    ({"height": 1e30}, r"height must be within ±10 m, got 1e\+30; hold the last"),
+    ({"gravity": [0.0, 0.0, -9.81]}, "gravity must be a unit vector, got length 9.81; hold the last"),
+    ({"angle": np.zeros(12, dtype="datetime64[s]")}, "angle must be numbers"),
+    ({"jump_comand": 1.0}, "readings missing or unknown: jump_comand"),
+    ({"lin_vel": np.zeros(2)}, r"lin_vel must have 3 values, got shape \(2,\)"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG_READINGS)
+def test_refuses_wrong_readings_and_keeps_the_history(change, message):
     policy, faultless = onnx_of("vertical_jump"), onnx_of("vertical_jump")
     readings = zero_readings(policy)
-    with pytest.raises(InputError, match=f"^{message}; hold the last target$"):
+    with pytest.raises(InputError, match=message):
         policy.targets(readings | change)
     np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
 
@@ -262,28 +261,12 @@ def test_refuses_weights_in_another_file_than_the_checksum_covers(tmp_path, monk
         DeployedPolicy("policy.onnx")
 
 
-@pytest.mark.parametrize("speed", [math.nan, -1.0, 0.0, math.inf, "x", None])
-def test_jump_command_refuses_a_takeoff_speed_that_no_robot_reaches(speed):
-    with pytest.raises(InputError, match="takeoff_speed must be above 0 to 20 m/s"):
-        JumpCommand(speed)
-
-
-def test_refuses_readings_of_another_type():
-    policy = onnx_of("vertical_jump")
-    readings = zero_readings(policy)
-    angle = np.zeros(12)
-    for wrong in (angle + 0.5j, angle.astype(str), angle.astype("datetime64[s]")):
-        with pytest.raises(InputError, match="angle must be numbers"):
-            policy.targets(readings | {"angle": wrong})
-    for other in (None, 1):
-        with pytest.raises(InputError, match="readings must be a mapping"):
-            policy.targets(other)
-
-
-@pytest.mark.parametrize("values", [(1.0e30, 4), (0.0, -1), (0.0, 5)])  # vertical velocity [m/s], paws down
-def test_jump_command_refuses_implausible_values(values):
-    with pytest.raises(InputError, match="vertical_velocity must be within ±20 m/s and paws_down 0 to 4"):
-        JumpCommand().update(*values)
+@pytest.mark.parametrize(
+    ("speed", "values"), [(math.nan, (0.0, 4)), ("x", (0.0, 4)), (0.75, (1.0e30, 4)), (0.75, (0.0, 5))]
+)
+def test_jump_command_refuses_implausible_values(speed, values):  # vertical velocity [m/s], paws down
+    with pytest.raises(InputError, match=r"takeoff_speed must be|vertical_velocity must be"):
+        JumpCommand(speed).update(*values)
 
 
 def test_exported_file_has_its_checksum_and_the_weights_of_the_policy(tmp_path):
@@ -306,20 +289,6 @@ def test_files_named_in_the_tutorial_suffice_on_the_robot(tmp_path):
     answer = subprocess.run([sys.executable, "-c", code], **settings, text=True)
     assert answer.returncode == 0, answer.stderr
     assert float(answer.stdout) == pytest.approx(math.radians(45.0))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"jump_comand": 1.0}, "readings missing or unknown: jump_comand"),
-        ({"lin_vel": np.zeros(2)}, r"lin_vel must have 3 values, got shape \(2,\)"),
-    ],
-)
-def test_refuses_unknown_readings_and_wrong_sizes(change, message):
-    policy = onnx_of("vertical_jump")
-    readings = zero_readings(policy)
-    with pytest.raises(ValueError, match=message):
-        policy.observe(readings | change)
 
 
 def test_jump_command_ends_with_the_landing():

@@ -55,13 +55,6 @@ def test_a_jump_commanded_at_an_infinite_step_is_never_commanded(step):
     assert not env.task_arrays()["idle_steps"].any()
 
 
-@pytest.mark.parametrize("step", [2.5, -1.0, math.nan])
-def test_refuses_a_command_step_that_is_no_count(step):
-    env = make_env(N)
-    with pytest.raises(InputError, match="must be"):
-        env.evaluation_reset([0.0, 0.0, 0.9, step])
-
-
 @pytest.mark.parametrize("steps", [2.0**31, 3.0e9, math.inf])
 def test_a_time_limit_of_infinite_steps_ends_no_episode(steps):
     env = make_env(N, task=make_task("vertical-jump").with_terms("terminations", too_long={"steps": 5.0}))

@@ -2,20 +2,16 @@
 
 import io
 from contextlib import redirect_stdout
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
 from box_robot import box_recording, walk
 from full_disk import full_disk
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
-from jumper_warp.evaluation.run import write_trials
 from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.robot.export import export_robot
 from jumper_warp.viz.film import write_film
-from jumper_warp.viz.plots import figure
 from jumper_warp.viz.rerun import write_rrd
 from toy_task import SMALL, PushTask
 
@@ -23,18 +19,6 @@ from toy_task import SMALL, PushTask
 def film(path):
     """Write a small film of a box to a path."""
     write_film(box_recording(walk(1.0, seconds=0.2)), path, size=(96, 64))
-
-
-def plot(path):
-    """Write an empty plot to a path."""
-    with figure(path):
-        pass
-
-
-def trials(path):
-    """Write the trials of a log to the path of trials.npz."""
-    numbers = np.random.default_rng(0).normal(size=1000).tolist()
-    write_trials(path.parent, SimpleNamespace(columns=lambda: {"apex_m": numbers}), 1)
 
 
 def rsl_rl_checkpoint(path):
@@ -47,9 +31,11 @@ def rsl_rl_checkpoint(path):
 
 
 WRITERS = {
-    "box.rrd": lambda path: write_rrd(box_recording(walk(1.0)), path), "box.gif": film, "box.webp": film,
-    "box.mp4": film, "plot.png": plot, "trials.npz": trials, "model_0.pt": rsl_rl_checkpoint,
-}  # fmt: skip
+    "box.rrd": lambda path: write_rrd(box_recording(walk(1.0)), path),
+    "box.gif": film,
+    "box.mp4": film,
+    "model_0.pt": rsl_rl_checkpoint,
+}
 
 
 @pytest.mark.parametrize("name", WRITERS)
