@@ -15,9 +15,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -25,7 +23,6 @@ import warp as wp
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo, use_fused
-from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.networks import gaussian_log_prob
 from jumper_warp.utils.errors import InputError
@@ -147,28 +144,11 @@ def repeats(args: Args, device: torch.device) -> bool:
 
 
 def times(ppo: Learner, args: Args) -> dict[str, float]:
-    """Return the times [us] of an acting step, an update and parts of a fused minibatch; on a GPU as CUDA graphs."""
+    """Return the times [us] of an acting step and an update, on a GPU as CUDA graphs."""
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
-    parts: dict[str, Callable[[], object]] = {"collect": ppo.collect, "update": ppo.update}
-    if ppo.cfg.fused:
-        fused = cast("FusedPpo", ppo)
-        samples = ppo.order()[: ppo.batch_size // ppo.cfg.minibatches].clone()
-        rollout = fused.rollout
-        parts |= {"gradient": lambda: fused.fused.compute_gradient(samples), "adam": fused.fused.update_parameters}
-        for name, features in (("actor", rollout.features), ("critic", rollout.critic_features)):
-            network = getattr(fused.networks, name)
-            work = (features.flatten(0, 1), len(samples), samples)
-            parts |= {f"{name}_forward": partial(network.forward, *work)}
-            parts |= {f"{name}_backward": partial(network.backward, *work)}
-    values = {}
-    for name, part in parts.items():
-        captured = CapturedProcedure(part, ppo.env.device.type == "cuda" and name not in ("collect", "update"))
-        for _ in range(2):  # eager, capture
-            captured()
-        values[f"{name}_us"] = 1.0e6 * median_time(captured, args.device, args.calls)
-        captured.close()
-    return values | {"act_us": values["collect_us"] / args.num_steps}
+    collect, update = (1.0e6 * median_time(part, args.device, args.calls) for part in (ppo.collect, ppo.update))
+    return {"collect_us": collect, "update_us": update, "act_us": collect / args.num_steps}
 
 
 def main(args: Args) -> dict:

@@ -47,11 +47,6 @@ class LearningCurve:
         return next((i for i, success in enumerate(self.success) if success >= rate), None)
 
 
-def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
-    """Return a nominal environment of `jumps` worlds, without noise and collision margins, to evaluate policies."""
-    return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
-
-
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, goals: np.ndarray) -> JumpLog:
     """Run one jump per world to a commanded goal, and return the finished log.
 
@@ -137,7 +132,8 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     trainer = make_ppo(env, cfg)
     warm_up(env, trainer)
     ready = process_age()
-    eval_env = make_eval_env(task, args.num_jumps, args.device)
+    settings = {"randomize": False, "noise": False, "auto_reset": False}
+    eval_env = Env(task.without_margins(), args.num_jumps, device=args.device, **settings)
     success_rate(trainer, eval_env)
     length, every = args.seconds, args.eval_interval
     if args.iterations:

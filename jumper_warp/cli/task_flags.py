@@ -105,11 +105,6 @@ def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
     return Setting(kind, kind(*(flag.value for flag in flags.values())), about)
 
 
-def _members(group: Any) -> Json:
-    """Return the values of a group of flags by name; group: an instance of a dataclass by `_group`."""
-    return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
-
-
 def with_flags(value: Any, flags: Any) -> Any:
     """Return a copy of a task, or a part of it, with the values in flags (result of `flags_of`, modified by tyro).
 
@@ -119,7 +114,7 @@ def with_flags(value: Any, flags: Any) -> Any:
         return dataclasses.replace(value, settings=with_flags(value.settings, flags))
     if not (parts := _parts(value)):
         return flags
-    values = _members(flags)
+    values = {spec.metadata["flag"]: getattr(flags, spec.name) for spec in dataclasses.fields(flags)}
     new = {name: with_flags(part, values[flag_name(name)]) for name, part in parts.items() if flag_name(name) in values}
     if isinstance(value, Term):
         return value.replace(**{key: number for key, number in new.items() if number != parts[key]})

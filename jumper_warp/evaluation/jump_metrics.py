@@ -77,13 +77,13 @@ IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error
 """Keys of metrics that are also reported for goals within a range, with the prefix `in_range_`."""
 
 
-def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: str = "", note: str = "") -> Metrics:
+def jump_metrics(outcome: JumpOutcome, prefix: str = "", note: str = "") -> Metrics:
     """Return success rates, errors and failures of jumps to heights or to landing positions.
 
     These are HEIGHT_METRICS or PLACE_METRICS; arguments: see `measure`.
     """
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
-    return measure(table, outcome, where, prefix, note)
+    return measure(table, outcome, None, prefix, note)
 
 
 def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:

@@ -147,9 +147,9 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
 
 
-def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:
-    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: what the trials are."""
-    return {f"{prefix}{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
+def ended_by(outcomes: np.ndarray, over: str) -> Metrics:
+    """Return the rate of each outcome that occurs, as `ended_by_<outcome>_rate`; over: what the trials are."""
+    return {f"ended_by_{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
 
 
 def listed(columns: Mapping[str, np.ndarray]) -> dict[str, list]:

@@ -15,7 +15,7 @@ from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.robot.motors import FilterCfg, walking_filter
+from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
@@ -27,13 +27,12 @@ MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of a free base's origin above t
 MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 
-def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
+def unsafe_reason(plan: Plan, record: Record) -> str:
     """Return the reason why a simulated identification motion is unsafe, or an empty string if it is safe.
 
-    plan: its motor targets; record: motion of one world. limits: limits of motor angles, by default the walking
-    filter's.
+    plan: its motor targets; record: motion of one world. Limits of motor angles are the walking filter's.
     """
-    limits = walking_filter() if limits is None else limits
+    limits = walking_filter()
     angle = record.angle[..., 0] / DEGREES
     rate = np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from functools import cache
 
 import numpy as np
 
@@ -86,19 +85,13 @@ def check_range(name: str, pair: tuple[float, float], unit: float = 1.0) -> None
         raise InputError(f"randomisation range {name} must {bound}, got {pair}")
 
 
-@cache
-def _base_mass() -> float:
-    """Return the mass of the base link in the robot description [kg]."""
-    return load_description().links[0].mass
-
-
 def _least(name: str) -> tuple[float, bool]:
     """Return the smallest value that a randomisation range may contain, in its unit, and whether it is itself excluded.
 
     name: the range's field in `RandomizationCfg`.
     """
     if name == "base_mass":
-        return -_base_mass(), True
+        return -load_description().links[0].mass, True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
         return 0.0, True
     return -math.inf, False

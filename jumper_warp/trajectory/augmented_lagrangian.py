@@ -43,24 +43,17 @@ class Progress:
 
 
 def minimise(
-    problem: Problem,
-    begin: np.ndarray,
-    *,
-    iterations: int = 100,
-    lower: float = -1.0,
-    upper: float = 1.0,
-    step: float = 0.1,
-    seed: int = 0,
+    problem: Problem, begin: np.ndarray, *, iterations: int = 100, step: float = 0.1, seed: int = 0
 ) -> Progress:
     """Minimise a trajectory optimisation problem by the augmented Lagrangian method, from many starts in parallel.
 
-    Returns the best candidates. begin: (starts, n = len(problem.knots)); lower, upper: bounds of all entries. An
+    Returns the best candidates. begin: (starts, n = len(problem.knots)), all entries within ±1. An
     iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations for each start. step [1]: largest entry of the
     first steps. seed: of the random steps. Raises InputError: `begin` has another shape.
     """
     if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
         raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")
-    descent = _Descent(problem, begin, lower, upper, step, seed)
+    descent = _Descent(problem, begin, step, seed)
     started = time.perf_counter()
     for number in range(iterations):
         descent.iterate(number)
@@ -79,13 +72,11 @@ def minimise(
 class _Descent:
     """State of an optimisation by the augmented Lagrangian method, for all starts in parallel."""
 
-    def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
+    def __init__(self, problem: Problem, begin: np.ndarray, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
         self.problem = problem
-        self.lower = lower
-        self.upper = upper
         device = str(problem.rollout(len(begin)).device)
-        self.x = torch.as_tensor(begin, dtype=real, device=device).clamp(lower, upper)
+        self.x = torch.as_tensor(begin, dtype=real, device=device).clamp(-1.0, 1.0)
         self.step = torch.full((len(begin),), step, dtype=real, device=device)
         self.rng = np.random.default_rng(seed)
         self.pairs: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
@@ -124,7 +115,7 @@ class _Descent:
             1,
         )
         count = steps.shape[1]
-        tried = (self.x[:, None] + steps).clamp(self.lower, self.upper)
+        tried = (self.x[:, None] + steps).clamp(-1.0, 1.0)
         flat = tried.flatten(0, 1)
         with torch.no_grad():
             tried_values = self.problem.evaluate(flat)
@@ -152,7 +143,7 @@ class _Descent:
 
     def _direction(self, gradient: torch.Tensor) -> torch.Tensor:
         """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
-        out = ((self.x <= self.lower) & (gradient > 0.0)) | ((self.x >= self.upper) & (gradient < 0.0))
+        out = ((self.x <= -1.0) & (gradient > 0.0)) | ((self.x >= 1.0) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
         # names as in the book's algorithm 7.4
         d = free

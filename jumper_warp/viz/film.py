@@ -121,8 +121,9 @@ def _images(
         for i, (frame, time) in enumerate(zip(frames, times, strict=True)):
             view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target)
             image = renderer.draw(poses[i], view, _lines(recording, paths, bases[i], frame, ranks))
-            labels = [] if len(ranks) == 1 else _world_labels(recording, bases[i], ranks)
-            yield annotate(image, view, labels, _heading(recording, time, ranks))
+            named = zip(ranks, bases[i], strict=True) if len(ranks) > 1 else ()
+            labels = [Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in named]
+            yield annotate(image, view, labels, f"{recording.heading(ranks)}   {time:.2f} s".strip())
             advance()
 
 
@@ -184,16 +185,6 @@ def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: in
             lines += [Line(paws[:, leg], color) for leg, color in enumerate(LEG_COLORS.values()) if leg < paws.shape[1]]
         lines += velocity_arrows(recording, frame, rank, base + [0.0, 0.0, 0.3])
     return lines
-
-
-def _world_labels(recording: Recording, bases: np.ndarray, ranks: Sequence[int]) -> list[Label]:
-    """Return the names of the worlds above their robots; bases: positions [m], (worlds, 3)."""
-    return [Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in zip(ranks, bases, strict=True)]
-
-
-def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
-    """Return the text at the top of a film: policy, task, goal of a single world, and time."""
-    return "   ".join(filter(None, [recording.heading(ranks), f"{time:.2f} s"]))
 
 
 def _encode_mp4(path: Path, target: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float) -> None:
