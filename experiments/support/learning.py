@@ -132,8 +132,8 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     trainer = make_ppo(env, cfg)
     warm_up(env, trainer)
     ready = process_age()
-    settings = {"randomize": False, "noise": False, "auto_reset": False}
-    eval_env = Env(task.without_margins(), args.num_jumps, device=args.device, **settings)
+    nominal = task.without_margins()
+    eval_env = Env(nominal, args.num_jumps, device=args.device, randomize=False, noise=False, auto_reset=False)
     success_rate(trainer, eval_env)
     length, every = args.seconds, args.eval_interval
     if args.iterations:

@@ -45,10 +45,14 @@ class Flag(NamedTuple):
         return tyro.conf.Positional in self.marks
 
     @property
+    def has_negative(self) -> bool:
+        """Whether the flag has an opposite, with `no-` before the last part of its name."""
+        return self.kind is bool and tyro.conf.FlagCreatePairsOff not in self.marks
+
+    @property
     def options(self) -> list[str]:
         """Spellings of the flag on the command line, with leading dashes: itself and, for a switch, its opposite."""
-        switch = self.kind is bool and tyro.conf.FlagCreatePairsOff not in self.marks
-        negative = [re.sub(r"([^.]+)$", r"no-\1", self.name)] if switch else []
+        negative = [re.sub(r"([^.]+)$", r"no-\1", self.name)] if self.has_negative else []
         return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
 
     @property

@@ -10,7 +10,6 @@ import runpy
 import shlex
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -107,12 +106,7 @@ class Commands:
         elif name in ("python", "python3", "torchrun") and scripts and "-m" not in words[: scripts[0]]:
             self.check_script(words[scripts[0]], words[scripts[0] + 1 :])
         elif name == "make":
-            targets = {line.split(":")[0] for line in (ROOT / "Makefile").read_text().splitlines() if ":" in line}
-            if missing := [word for word in words if word[0] != "-" and "=" not in word and word not in targets]:
-                raise CommandError(f"the Makefile has no target {missing[0]}")
             self.made["outputs"] = None
-        elif name == "pip":
-            check_extras(words)
         elif name in VIEWERS:
             for word in words:
                 if "/" in word or Path(word).suffix:
@@ -236,14 +230,3 @@ def run_here(call):
         except SystemExit as error:
             if error.code:
                 raise CommandError(errors.getvalue().strip() or f"exit code {error.code}") from None
-
-
-def check_extras(words):
-    """Raise CommandError if a `pip install` names an extra of this package that does not exist."""
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for word in words:
-        package, bracket, names = word.rstrip("]").partition("[")
-        if bracket and package in (".", "jumper-warp", "jumper_warp"):
-            for name in names.split(","):
-                if name not in extras:
-                    raise CommandError(f"there is no extra {name!r}")

@@ -29,7 +29,6 @@ from snippet_commands import ROOT, CommandError, Commands, command_lines
 
 COMMENT = re.compile(r"<!--\s*(run|needs|skip|file)\b:?\s*(.*?)\s*-->")
 FILE_NAME = re.compile(r"#\s*([\w./-]+\.\w+)\s*\n")  # first line of a Python fence
-MISSPELT = {"sh": "bash", "shell": "bash", "console": "bash", "py": "python", "python3": "python", "pycon": "python"}
 LINKED = ("assets", "experiments")  # folders of the repository that a page's working folder has, too
 
 
@@ -69,8 +68,6 @@ class Page:
     def evaluate(self, example):
         """Run, check, write or skip a fence; a Sybil evaluator. Raises PageError: the rest of the page cannot run."""
         (language, source), notes = example.parsed, notes_above(example)
-        if notes.get("skip") == "":
-            self.fail(example.line, "the reason is missing in <!-- skip: reason -->")
         missing = [name for name in notes.get("needs", "").replace(" ", "").split(",") if name and not installed(name)]
         if "skip" in notes or missing:
             return
@@ -82,8 +79,6 @@ class Page:
             self.run_python(example.line, source)
         elif language == "bash":
             self.evaluate_bash(example.line, source, notes)
-        elif language in MISSPELT:
-            self.fail(example.line, f"write {MISSPELT[language]} in place of {language}")
 
     def run_python(self, line, source):
         """Execute a fence that opens at a line, so that tracebacks and Warp find its lines in the page."""

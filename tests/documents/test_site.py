@@ -1,8 +1,6 @@
 """Generators of the documentation site: references, links and docstrings."""
 
 import re
-import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +12,6 @@ from jumper_warp.cli.main import COMMANDS
 from jumper_warp.cli.train import SHORT_HELP
 from jumper_warp.registry import TASKS, make_task
 from repository import relocated
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +78,3 @@ def test_links_of_an_included_file_lead_from_the_including_page():
         "[a](../../../assets/policies/y/picture.webp) [`b`](../../../assets/policies/x/README.md#top)"
         " [c](#here) [d](https://e.org) `[e](f)`"
     )
-
-
-def test_citation_has_the_version_of_the_package():
-    version = next(line for line in (ROOT / "CITATION.cff").read_text().splitlines() if line.startswith("version:"))
-    name = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["dynamic"]["version"]["attr"]
-    assert name == "jumper_warp.utils.version.__version__"
-    assert f'__version__ = "{version.split()[1]}"' in (ROOT / "jumper_warp/utils/version.py").read_text()
