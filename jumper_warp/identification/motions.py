@@ -17,10 +17,10 @@ from typing import Any, Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS
-from jumper_warp.utils.arrays import read_npz
+from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.checks import check_bounds
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file, parse_json, read_file, read_json, write_atomically
+from jumper_warp.utils.files import existing_file, parse_json, read_file, read_json
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
@@ -143,9 +143,7 @@ class RecordedMotion:
         """Write the motion as npz for `load_motion`. Raises OSError."""
         settings = {name: getattr(self, name) for name in ("base", "gains", "torque_limit")}
         settings["notes"] = dict(self.notes)
-        data = io.BytesIO()
-        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self.columns())
-        write_atomically(path, data.getvalue())
+        write_npz(path, settings=np.array(json.dumps(settings)), **self.columns())
 
 
 def check_distinct(motions: Sequence[RecordedMotion]) -> None:

@@ -3,7 +3,6 @@
 A recording is self-contained: it can be drawn without the Newton model.
 """
 
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -12,22 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.utils.arrays import read_npz
+from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json, parse_json, write_atomically
+from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
-ARRAYS = (
-    "times",
-    "poses",
-    "contact_points",
-    "contact_forces",
-    "goals",
-    "heights",
-    "commands",
-)  # fields of `Recording` that are arrays
+ARRAYS = ("times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands")
+"""Fields of `Recording` that are arrays."""
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
@@ -104,9 +96,7 @@ class Recording:
         arrays["series"] = np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1)
         for index, shape in enumerate(self.shapes):
             arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
-        data = io.BytesIO()
-        np.savez_compressed(data, **arrays)
-        write_atomically(Path(path), data.getvalue())
+        write_npz(Path(path), **arrays)
         return Path(path)
 
 

@@ -26,7 +26,6 @@ import numpy as np
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 from jumper_warp.viz.props import goal_shapes
-from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR, LEG_COLORS
 
 if TYPE_CHECKING:
@@ -88,7 +87,13 @@ class _Writer:
         self.stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for shape in (*recording.shapes, *goal_shapes(recording)):
             parent = ["scene"] if shape.body < 0 else parents[shape.body]
-            self.stream.log(rr.new_entity_path([*parent, shape.name]), _mesh(rr, shape), static=True)
+            mesh = rr.Mesh3D(
+                vertex_positions=shape.vertices,
+                vertex_normals=shape.normals,
+                triangle_indices=shape.triangles,
+                albedo_factor=[*_rgb([shape.color])[0], 255],
+            )
+            self.stream.log(rr.new_entity_path([*parent, shape.name]), mesh, static=True)
         for index, parent in enumerate(parents):
             pos, quat = np.split(recording.poses[:, index], [3], axis=1)
             self._send(parent, rr.Transform3D.columns(translation=pos, quaternion=quat))
@@ -163,16 +168,6 @@ def _world_names(recording: "Recording") -> list[str]:
     """Return distinct names of the recorded worlds for entity paths."""
     labels = [recording.label(rank) for rank in range(len(recording.worlds))]
     return labels if len(set(labels)) == len(labels) else [f"world_{world}" for world in recording.worlds]
-
-
-def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
-    """Convert a shape to a Rerun mesh, in the body's frame, with an opaque color."""
-    return rr.Mesh3D(
-        vertex_positions=shape.vertices,
-        vertex_normals=shape.normals,
-        triangle_indices=shape.triangles,
-        albedo_factor=[*_rgb([shape.color])[0], 255],
-    )
 
 
 def _rgb(colors: Iterable[tuple[float, float, float]]) -> np.ndarray:
