@@ -21,7 +21,7 @@ VERSION = 2
 ARRAYS = ("times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands")
 """Fields of `Recording` that are arrays."""
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
-FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
+FARTHEST = 1.0e6  # [m] Largest coordinate of a body that is drawn
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a dimensionless quantity is 1."""
 
