@@ -3,25 +3,34 @@
 A recording is self-contained: it can be drawn without the Newton model.
 """
 
+import io
 import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jumper_warp.utils.arrays import read_npz, write_npz
+from jumper_warp.utils.arrays import read_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json, parse_json
+from jumper_warp.utils.files import Json, parse_json, write_atomically
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
-ARRAYS = ("times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands")
-"""Fields of `Recording` that are arrays."""
+ARRAYS = (
+    "times",
+    "poses",
+    "contact_points",
+    "contact_forces",
+    "goals",
+    "heights",
+    "commands",
+)  # fields of `Recording` that are arrays
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
-FARTHEST = 1.0e6  # [m] Largest coordinate of a body that is drawn
+FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a dimensionless quantity is 1."""
 
@@ -96,21 +105,27 @@ class Recording:
         arrays["series"] = np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1)
         for index, shape in enumerate(self.shapes):
             arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
-        write_npz(Path(path), **arrays)
+        data = io.BytesIO()
+        np.savez_compressed(data, **arrays)
+        write_atomically(Path(path), data.getvalue())
         return Path(path)
 
 
 def load_npz(path: Path) -> Recording:
     """Load a recording from a file written by `Recording.save_npz`.
 
-    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version.
+    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version, or an
+    entry has another type or shape.
     """
     archive = read_npz(path, "recording", RecordingError)
     try:
         header = parse_json(str(archive["header"]), "header")
         if header["format"] != FORMAT or header["version"] != VERSION:
             raise RecordingError(f"expected a {FORMAT} of version {VERSION}")
-        return _from_archive(header, archive)
+        recording = _from_archive(header, archive)
+        _check_arrays(recording)
+        _check_names(recording)
+        return recording
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
 
@@ -134,3 +149,62 @@ def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
         labels=tuple(header["labels"]),
         states=header["states"],
     )
+
+
+def _check(name: str, valid: Any) -> None:
+    """Raise RecordingError, with the name of an entry, unless it is valid."""
+    if not valid:
+        raise RecordingError(f"{name} is of another type or shape, or out of range")
+
+
+def _check_arrays(recording: Recording) -> None:
+    """Raise RecordingError for an array of another type or shape, or times or meshes that cannot be drawn."""
+    frames, worlds, bodies = (len(part) for part in (recording.times, recording.worlds, recording.bodies))
+    contacts, goals = recording.contact_points.shape[2:3], recording.goals.shape[1:2]
+    for name, *shapes in (
+        ("times", (frames,)),
+        ("poses", (frames, bodies, 7)),
+        ("contact_points", (frames, worlds, *contacts, 3)),
+        ("contact_forces", (frames, worlds, *contacts, 3)),
+        ("goals", (worlds, *goals, 3), (0, *goals, 3)),
+        ("heights", (worlds,), (0,)),
+        ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
+    ):
+        values = getattr(recording, name)
+        _check(name, values.dtype.kind in "fiu" and values.shape in shapes)
+    for values in recording.series.values():
+        _check("series", values.dtype.kind in "fiu" and values.shape == (frames,))
+    times = recording.times
+    _check("times", frames > 0 and np.isfinite(times).all() and (np.diff(times) > 0.0).all())
+    points = recording.contact_points[np.isfinite(recording.poses).all(axis=(1, 2))]  # where no world has diverged
+    _check("poses", not (np.abs(recording.poses[0]) > FARTHEST).any())
+    _check("contact_points", (np.abs(points) <= FARTHEST).all())
+    for shape in recording.shapes:
+        for name in SURFACE:
+            values = getattr(shape, name)
+            kinds, count = ("iu", -1) if name == "triangles" else ("f", len(shape.vertices))
+            valid = values.dtype.kind in kinds and values.ndim == 2 and values.shape[1] == 3
+            _check(f"{name} of a shape", valid and np.isfinite(values).all() and count in (-1, len(values)))
+        corners = shape.triangles
+        _check("triangles of a shape", corners.size and 0 <= corners.min() and corners.max() < len(shape.vertices))
+
+
+def _check_names(recording: Recording) -> None:
+    """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies."""
+    worlds = recording.worlds
+    frames = len(recording.times)
+    _check("worlds", worlds and all(type(world) is int and world >= 0 for world in worlds))
+    _check("worlds", len(set(worlds)) == len(worlds))
+    _check("bodies", all(re.fullmatch(r"world_\d+/.+", body) for body in recording.bodies))
+    _check("bodies", {f"world_{world}" for world in worlds} == {body.split("/")[0] for body in recording.bodies})
+    _check("series", all(SERIES_NAME.fullmatch(name) for name in recording.series))
+    _check("labels", len(recording.labels) in (0, len(worlds)) and all(type(each) is str for each in recording.labels))
+    _check("notes", isinstance(recording.notes, dict))
+    for words in recording.states.values():
+        _check("states", type(words) is list and len(words) == frames and all(type(word) is str for word in words))
+    _check("spacing", type(recording.spacing) in (int, float) and abs(recording.spacing) <= FARTHEST)
+    for shape in recording.shapes:
+        _check("name of a shape", type(shape.name) is str)
+        _check("body of a shape", type(shape.body) is int and -1 <= shape.body < len(recording.bodies))
+        valid = len(shape.color) == 3 and all(type(part) in (int, float) and 0.0 <= part <= 1.0 for part in shape.color)
+        _check("color of a shape", valid)
