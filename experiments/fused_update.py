@@ -24,7 +24,7 @@ import warp as wp
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo, use_fused
 from jumper_warp.rl.learner import Learner
-from jumper_warp.rl.networks import gaussian_log_prob
+from jumper_warp.rl.networks import gaussian_log_prob, linear_layers
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -96,7 +96,7 @@ def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
     """
     cfg, flat = ppo.cfg, ppo.flat
     with torch.no_grad():
-        ppo.model.actor[-1].weight.mul_(30.0)  # the initial actions are too small to test the clipping
+        linear_layers(ppo.model.actor)[-1][0].mul_(30.0)  # the initial actions are too small to test the clipping
         ppo.collector.roll()
         ppo.batch()
         for segment in flat.segments:

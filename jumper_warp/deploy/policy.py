@@ -62,9 +62,10 @@ class DeployedPolicy:
         options.log_severity_level = 4
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:  # ONNX Runtime's errors have no common class
             raise InputError(f"{file}: not an ONNX file that ONNX Runtime can load ({error!s:.200})") from None
-        self.interface = _interface(file, self._session.get_modelmeta().custom_metadata_map)
+        self.interface = _interface(file, metadata)
         self.layout: dict[str, Any] = self.interface["observation_layout"]
         self.scale = np.array(self.interface["action_scale"], dtype=np.float32)  # (12,) [rad] for an action of 1
         self.default = np.array(self.interface["default_joint_pos"], dtype=np.float32)  # (12,) [rad]

@@ -12,6 +12,7 @@ if the update ends anywhere, such as on a full disk.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ PICTURES = (".png", ".webp", ".jpg", ".gif")  # Suffixes of files that a policy 
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
 PURPOSE = "file of a policy"
+FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
 SUCCESSES = ("success_rate", "settled_without_collision_rate")
 """Keys of the success rate; a policy's is the first one that its metrics have."""
@@ -130,10 +132,14 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
     if manifest.get("format") != FORMAT:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
     check_version(path, manifest)
-    saved = manifest["sha256"]
+    saved = manifest.get("sha256")
     updating = manifest.get("updating", {})
+    if not isinstance(saved, dict) or not isinstance(updating, dict):
+        raise PolicyError(f"{path}: has no table of checksums")
     files = {}
     for name in {CONFIG: "", ONNX: "", **saved, **updating}:
+        if not FILE_NAME.fullmatch(name):
+            raise PolicyError(f"{path}: names a file {name!r:.60}")
         if (name.endswith(PICTURES) or name not in saved) and not (folder / name).exists():
             continue
         files[name] = read_file(folder / name, PURPOSE, error=PolicyError)
@@ -224,15 +230,34 @@ def summarise(folder: Path) -> PolicySummary:
     try:
         files = read_files(folder)
         interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG])["interface"])
+        if METRICS not in files and (folder / METRICS).exists():
+            raise PolicyError(f"{METRICS} is not in {MANIFEST}")
         readme = folder / README
-        about = first_paragraph(readme.read_text()) if readme.is_file() else ""
+        if os.path.dirname(os.path.realpath(readme)) != os.path.realpath(folder):
+            raise PolicyError(f"{README} is a link to another folder")
+        about = first_paragraph(read_file(readme, PURPOSE).decode()) if os.path.lexists(readme) else ""
         saved = parse_object(folder / METRICS, files[METRICS]) if METRICS in files else {"rows": []}
         rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
+        for row in rows:
+            _check_row(row)
         return PolicySummary(folder.resolve().name, folder, interface.task, about, len(files[ONNX]), rows)
-    except (ValueError, LookupError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         message = f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run"
         raise PolicyError(message) from error
+
+
+def _check_row(row: Json) -> None:
+    """Raise PolicyError, or LookupError or such, unless metrics in one condition are as in docs/metrics.schema.json."""
+    metrics = row["metrics"].values()
+    shown = (*SUCCESSES, *ERRORS, "fall_rate")
+    numbers = [metric["value"] for key, metric in row["metrics"].items() if key in shown]
+    numbers += [metric["trials"] for metric in metrics]
+    texts = [metric["unit"] for metric in metrics]
+    valid = isinstance(row["condition"], str) and isinstance(row["conditions"], dict) and metrics
+    valid = valid and all(type(number) in (int, float, type(None)) for number in numbers)
+    if not valid or not all(isinstance(text, str | None) for text in texts):
+        raise PolicyError(f"{METRICS}: metrics of another type than docs/metrics.schema.json has")
 
 
 def first_paragraph(markdown: str) -> str:

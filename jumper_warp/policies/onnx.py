@@ -166,6 +166,8 @@ def _is_tensor(stored: TensorProto) -> bool:
 
 def _read_tensor(stored: TensorProto) -> tuple[str, torch.Tensor]:
     """Return the name (see `Policy.tensors`) and the value of an initialiser; a repeated block becomes the weight."""
+    if stored.data_location == TensorProto.EXTERNAL:
+        raise ValueError(f"{stored.name} is in another file")
     tensor = torch.from_numpy(numpy_helper.to_array(stored).copy())
     name = NORMALISER_TENSORS.get(stored.name) or stored.name.replace("_", ".")
     if name.endswith(".block"):

@@ -13,6 +13,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, parse_json
 
 FORMAT, VERSION = "jumper-warp dump", 1
+GROUPS = ("rewards", "observations")  # Arrays of the values of all terms, whose names are in the header
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
@@ -47,15 +48,21 @@ def write_dump(path: Path, found: NonFiniteValue, **header: Any) -> None:
 def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
     """Read a non-finite value and the header from a file that `write_dump` has written in a training.
 
-    Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, or of another kind or version.
+    Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, of another kind or version, or an
+    array has another type or shape.
     """
     arrays = read_npz(path, "dump of a training")
     try:
         header = parse_json(str(arrays.pop("header")), "header")
         if (header["format"], header["version"]) != (FORMAT, VERSION):
             raise InputError(f"expected a {FORMAT} of version {VERSION}")
+        names = header["names"]
+        shapes = {"joint_q": 43, "joint_qd": 38, "action": 12} | {group: len(names[group]) for group in GROUPS}
+        fits = all(arrays[name].shape == (size,) for name, size in shapes.items())
+        if not fits or any(values.dtype.kind not in "biuf" for values in arrays.values()):
+            raise InputError("an array has another shape or type")
         value = float(header["value"])
-        found = NonFiniteValue(header["term"], value, header["world"], header["step"], arrays, header["names"])
+        found = NonFiniteValue(header["term"], value, header["world"], header["step"], arrays, names)
     except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error})") from error
     return found, header

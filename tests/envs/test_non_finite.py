@@ -16,6 +16,7 @@ from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.utils.dumps import load_dump, write_dump
+from jumper_warp.utils.errors import InputError
 
 N = 48
 LIMIT = 1.0  # [m] The faulty terms are not finite above this height of the base
@@ -135,6 +136,10 @@ def test_dump_is_read_and_played(tmp_path, capsys):
     assert str(read) == str(found) and header["iteration"] == 3
     for name, values in found.arrays.items():
         np.testing.assert_array_equal(read.arrays[name], values)
+    damaged = tmp_path / "damaged.npz"
+    write_dump(damaged, found._replace(arrays=found.arrays | {"joint_q": np.zeros(42)}))
+    with pytest.raises(InputError, match="another shape"):
+        load_dump(damaged)
     recording = play_dump(DumpCfg(path, out=tmp_path / "film"))
     assert recording.is_file() and recording.with_suffix(".png").is_file()
     printed = capsys.readouterr().out

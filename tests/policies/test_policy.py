@@ -202,6 +202,12 @@ REFUSALS = {
         edit_manifest(lambda m: m.update(schema_version=2)),
         "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
+    "no checksums": (edit_manifest(lambda m: m.update(sha256=3)), "has no table of checksums"),
+    "file of another folder": (edit_manifest(lambda m: m["sha256"].update({"../x": "0"})), "names a file '../x'"),
+    "weights in another file": (
+        change_model(lambda m: [setattr(weight, "data_location", 1) for weight in m.graph.initializer]),
+        "is in another file",
+    ),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
