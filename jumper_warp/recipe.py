@@ -20,6 +20,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -47,7 +48,7 @@ class Recipe:
 
     @classmethod
     def from_json(
-        cls, config: dict[str, Any], modules: Iterable[ModuleType] | None = None, *, defaults: TrainCfg | None = None,
+        cls, config: Json, modules: Iterable[ModuleType] | None = None, *, defaults: TrainCfg | None = None,
         complete: bool = True,
     ) -> Recipe:  # fmt: skip
         """Restore the recipe in the configuration of a run, checkpoint or policy.
@@ -71,9 +72,9 @@ class Recipe:
             kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             raise TaskError(f"settings in its configuration: {kind}{error!s:.200}") from error
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Return the recipe as JSON data. Raises TaskError: a part of the task cannot be saved."""
-        env: dict[str, Any] = {name: getattr(self, name) for name in ("randomize", "noise")}
+        env: Json = {name: getattr(self, name) for name in ("randomize", "noise")}
         env |= {"task": task_to_json(self.task), "solver": next(k for k, v in SOLVERS.items() if v == self.solver)}
         env |= {} if self.robot is None else {"robot": self.robot.to_json()}
         return {"train": json.loads(json.dumps(dataclasses.asdict(self.train), default=str)), "env": env}
@@ -121,7 +122,7 @@ def _restored(saved: Any, modules: list[ModuleType], complete: bool) -> tuple[Ta
         return task_from_json(saved, modules, leave_out=OPTIONAL), str(error)
 
 
-def with_saved_settings(settings: Any, saved: dict[str, Any]) -> Any:
+def with_saved_settings(settings: Any, saved: Json) -> Any:
     """Return a copy of a dataclass with the values in `saved`, by field, nested dicts for nested dataclasses.
 
     Lists become tuples. Raises ValueError or TypeError: a value is invalid.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file, read_file, read_json, write_atomically
+from jumper_warp.utils.files import Json, existing_file, read_file, read_json, write_atomically
 
 MANIFEST = "manifest.json"  # File in the checkpoints' folder with SHA-256, iteration and score of each
 PURPOSE = "checkpoint of a training"
@@ -31,12 +31,12 @@ class Checkpoint(NamedTuple):
     """Loaded training checkpoint: its path and contents, and the reasons why newer ones cannot be used."""
 
     path: Path
-    state: dict[str, Any]  # contents, with at least the keys of REQUIRED
+    state: Json  # contents, with at least the keys of REQUIRED
     skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
     newest: str  # file name of the newest checkpoint in the folder when this one was loaded
 
 
-def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, max_checkpoints: int = 3) -> Path:
+def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_checkpoints: int = 3) -> Path:
     """Save a training's state as the file `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
 
     folder: created if missing. state: tensors, numbers and strings, with at least the keys of REQUIRED. score: higher
@@ -67,7 +67,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     return path
 
 
-def load_checkpoint(path: Path) -> dict[str, Any]:
+def load_checkpoint(path: Path) -> Json:
     """Return the training state in a checkpoint file of this package, with all tensors on the CPU.
 
     Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint; or its iteration
@@ -142,14 +142,14 @@ def best_checkpoint(folder: Path) -> Path:
     return folder / (_best(_read_manifest(folder)) or newest_name(folder))
 
 
-def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
+def _best(manifest: dict[str, Json]) -> str | None:
     """Return the file name of a manifest's last checkpoint with the highest finite score; None without scores."""
     scores = {name: entry["score"] for name, entry in manifest.items() if entry["score"] is not None}
     scored = [name for name in reversed(scores) if math.isfinite(scores[name])]
     return max(scored, key=scores.__getitem__, default=None)
 
 
-def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str, Any]]:
+def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, Json]:
     """Return the manifest of a folder of checkpoints: entries by file name, in the order of saving.
 
     Raises CheckpointError: it is unreadable.

@@ -22,6 +22,7 @@ from jumper_warp.rl.checkpoint import (
 )
 from jumper_warp.rl.run_names import newest
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
 
@@ -68,7 +69,7 @@ def check_unchanged(checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"{checkpoint.path.parent}: another process has saved a checkpoint; resume again")
 
 
-def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
+def rank_state(state: Json, rank: Rank) -> Json:
     """Return the state that one process (rank) restores from a checkpoint, with the entries `env`, `rng` and `ppo`.
 
     Raises InputError: another number of processes saved the checkpoint, or a part is missing.
@@ -85,7 +86,7 @@ def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     return local
 
 
-def saved_init_policy(state: dict[str, Any]) -> str | None:
+def saved_init_policy(state: Json) -> str | None:
     """Return the policy from which a checkpoint's training started (setting `init_policy`); None: none or unknown."""
     try:
         settings = json.loads(state["config"])["train"]
@@ -94,7 +95,7 @@ def saved_init_policy(state: dict[str, Any]) -> str | None:
         return None
 
 
-def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> dict[str, str]:
+def changed_settings(state: Json, config: Json) -> dict[str, str]:
     """Return the settings that differ between a checkpoint's configuration and `config`, as text `old -> new` by name.
 
     Empty if the checkpoint has no readable configuration.
@@ -107,7 +108,7 @@ def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> dict[str,
     return {name: f"{old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in changed}
 
 
-def check_changes(changed: Iterable[str], config: dict[str, Any]) -> None:
+def check_changes(changed: Iterable[str], config: Json) -> None:
     """Raise InputError if a changed setting is read at the start of a training only, and so would have no effect.
 
     Such settings are FIXED and, of robots that are nominal or sampled at startup, ranges and startup events.
@@ -122,7 +123,7 @@ def check_changes(changed: Iterable[str], config: dict[str, Any]) -> None:
         raise InputError(f"{', '.join(names)} cannot change after the start of a training")
 
 
-def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+def changed_user_files(state: Json, config: Json) -> list[str]:
     """List the user files whose content changed after the checkpoint was saved, one line each."""
     try:
         return changed_sources(json.loads(state["config"])["sources"], config["sources"])
@@ -130,7 +131,7 @@ def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[st
         return []
 
 
-def _settings(config: dict[str, Any]) -> dict[str, Any]:
+def _settings(config: Json) -> Json:
     """Return the settings in a run's configuration as a flat dict by flag name, without leading dashes."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
@@ -141,7 +142,7 @@ def _settings(config: dict[str, Any]) -> dict[str, Any]:
     return _flat(train) | _flat(env) | _flat(task, "env")
 
 
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
+def _flat(value: Any, name: str = "") -> Json:
     """Flatten nested dicts: return their leaves by dotted name, such as `ppo.num-steps`.
 
     Entries of lists are named by their key `name`.
@@ -154,7 +155,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     return {key: leaf for part in parts for key, leaf in part.items()}
 
 
-def saved_seconds(state: dict[str, Any]) -> float:
+def saved_seconds(state: Json) -> float:
     """Return the training time [s] saved in a checkpoint, 0 if it has none. Raises InputError: it is malformed."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:

@@ -14,7 +14,7 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.distributed import Rank, all_reduce_max
 from jumper_warp.rl.run_names import run_name
 from jumper_warp.utils.dumps import DUMPS, NonFiniteValue, write_dump
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 
@@ -42,7 +42,7 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     return folder
 
 
-def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
+def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> Json:
     """Return the configuration of a training run as JSON data: settings, environment, versions, commit, user files."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     commit, env_config = git_commit(), env.config()
@@ -57,13 +57,13 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
     }
 
 
-def write_config(folder: Path, config: dict[str, Any]) -> None:
+def write_config(folder: Path, config: Json) -> None:
     """Write the configuration of a training run to the run's folder, which exists. Raises OSError."""
     write_atomically(folder / CONFIG, json.dumps(config, indent=1).encode())
 
 
 def report_non_finite(
-    env: VecEnv, folder: Path, config: dict[str, Any], iteration: int, print_line: Callable[[str], None], rank: int = 0
+    env: VecEnv, folder: Path, config: Json, iteration: int, print_line: Callable[[str], None], rank: int = 0
 ) -> list[NonFiniteValue]:
     """For each task term that is non-finite for the first time, print a line and save a dump file; return their values.
 
@@ -81,7 +81,7 @@ def report_non_finite(
     return found
 
 
-def rescue_folder(folder: Path, config: dict[str, Any], names: Iterable[str]) -> tuple[Path, str]:
+def rescue_folder(folder: Path, config: Json, names: Iterable[str]) -> tuple[Path, str]:
     """Return the folder in which a training run continues, a new one if any file of `names` was deleted, and a message.
 
     If none was, return `folder` and an empty message.

@@ -24,6 +24,7 @@ from jumper_warp.tasks.copying import Struct, top_level
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.checks import FLOAT32_MAX, in_float32, version_error
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.sources import with_neighbours
 
 VERSION = 5  # of the saved format
@@ -72,12 +73,12 @@ def json_value(value: object) -> Any:
     return value
 
 
-def task_to_json(task: TaskCfg) -> dict[str, Any]:
+def task_to_json(task: TaskCfg) -> Json:
     """Return a task as JSON data: "version", and its fields by name. Raises TaskError: a part of it cannot be saved."""
     return {"version": VERSION, **json_value(task)}
 
 
-def handover_to_json(handover: Handover) -> dict[str, Any]:
+def handover_to_json(handover: Handover) -> Json:
     """Return a handover between tasks as JSON data: names of tasks and functions. Raises TaskError: see `name_of`."""
     tasks = {"source": handover.source.name, "target": handover.target.name}
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
@@ -152,7 +153,7 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
     return _object(content, TaskCfg, "task", Finder(modules))
 
 
-def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
+def _object(saved: Json, hint: Any, where: str, find: Finder) -> Any:
     """Return the term or dataclass that a JSON object describes; its "type" names a subclass of `hint`.
 
     The constructor checks the values. where: place for messages. Raises TaskError.
