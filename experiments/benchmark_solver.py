@@ -3,10 +3,10 @@
     python experiments/benchmark_solver.py --envs 4096 --out outputs/benchmark
 
 Speeds are policy steps per second of all environments together. A policy step is 8 physics steps of 1/480 s, motors
-included. Both solvers replay a captured graph. The outcome is checked before the timing: the robots must stand, or
-reach their apex. `--threads 1
-2` compares numbers of CPU threads, for physics and for whole environments; all other metrics are measured with the last
-number.
+included. Both solvers replay a captured graph, of the simulation with standing and jumping robots, and of whole
+environments in which the project's policy `vertical_jump` jumps. The outcome is checked before the timing: the robots
+must stand, or reach their apex. `--threads 1 2` compares numbers of CPU threads, for physics and for whole
+environments; all other metrics are measured with the last number.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.scripts import DeviceArgs, report, run_script
-from support.speed import time_solver, time_threads
+from support.speed import time_policy, time_solver, time_threads
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,9 @@ def main(args: Args) -> dict:
     sizes = args.steps, args.repeats, args.device
     for envs in args.envs:
         metrics = {f"{s}_{name}": value for s in args.solvers for name, value in time_solver(s, envs, *sizes).items()}
-        for phase in ("standing", "jump") if len(set(args.solvers)) == 2 else ():
+        for solver in args.solvers:
+            metrics[f"{solver}_steps_per_s_policy"] = envs / time_policy(envs, args.repeats, args.device, solver)
+        for phase in ("standing", "jump", "policy") if len(set(args.solvers)) == 2 else ():
             rates = (metrics[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
             metrics[f"ratio_{phase}"] = next(rates) / next(rates)
         if args.threads and len(args.threads) > 1:
@@ -54,8 +56,9 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
     values["envs"] = args.envs
-    names = [f"{s}_steps_per_s_{phase}" for phase in ("standing", "jump") for s in args.solvers]
-    keys = [key for key in values if key.endswith((*names, "ratio_standing", "ratio_jump", "thread_speedup"))]
+    names = [f"{s}_steps_per_s_{phase}" for phase in ("standing", "jump", "policy") for s in args.solvers]
+    ratios = ("ratio_standing", "ratio_jump", "ratio_policy")
+    keys = [key for key in values if key.endswith((*names, *ratios, "thread_speedup"))]
     return report(args, folder, values, f"Policy steps per second, {values['device']}", keys)
 
 

@@ -3,7 +3,8 @@
     python experiments/benchmark_training.py --envs 4096 8192 16384 --out outputs/benchmark_training
 
 Speeds are policy steps of 1/60 s per second, 8 physics steps each, of all environments together. The solver is timed
-with standing robots; environment and training have random or learned actions, randomisation and noise. rsl-rl-lib
+with standing robots. The environment, with randomisation and noise, is timed with random actions and with a policy's
+jumps; training has learned actions. rsl-rl-lib
 trains on the same environment through the package's adapter. Outcomes are checked before the timing.
 
 `--variants eager` also times PPO without the fused kernels, `--variants all` all variants of `support.variants`.
@@ -66,8 +67,9 @@ def main(args: Args) -> dict:
     if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
-    keys = [f"{part}_steps_per_s_{train_envs}" for part in ("solver", "env")]
-    keys += ["ppo_steps_per_s", "ppo_collect_s", "ppo_update_s", "rsl_rl_steps_per_s", "ppo_over_rsl_rl"]
+    keys = ["ppo_steps_per_s", f"env_steps_per_s_policy_{train_envs}"]
+    keys += [f"{part}_steps_per_s_{train_envs}" for part in ("env", "solver")]
+    keys += ["ppo_collect_s", "ppo_update_s", "rsl_rl_steps_per_s", "ppo_over_rsl_rl"]
     return report(args, folder, values, f"Training with {train_envs:,} environments, {info.name}", keys)
 
 

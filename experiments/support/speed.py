@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
@@ -23,6 +24,7 @@ from support.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
 JUMP_STEPS = 45  # Number of timed policy steps of the scripted jump: push-off, flight, landing
+POLICY_STEPS = 120  # Policy steps of the timed jumps of a policy
 CALLS = 3  # Number of launches of a part of a policy step per repetition
 
 
@@ -139,6 +141,32 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
     return env, step
 
 
+def time_policy(envs: int, repeats: int, device: str | None, solver: SolverName = "jumper") -> float:
+    """Time an environment whose robots jump: return the median wall time per policy step [s].
+
+    The actions of the project's policy `vertical_jump` are recorded, and repeated from the same state.
+    Raises RuntimeError: fewer than half of the robots reach 0.5 m.
+    """
+    env = Env(make_task("vertical-jump"), envs, device=device, solver=solver)
+    policy = load_policy("vertical_jump", env.device)
+    env.reset()
+    start = env.state_dict()
+    highest = np.zeros(envs)
+    actions = []
+    for _ in range(POLICY_STEPS):
+        actions.append(policy.act(env.obs))
+        env.step(actions[-1])
+        highest = np.maximum(highest, env.sim.joint_q()[:, 2])
+    if np.median(highest) < 0.5:
+        raise RuntimeError(f"the robots do not jump: median of their apexes {np.median(highest):.3f} m")
+    times = []
+    for _ in range(repeats):
+        env.load_state_dict(start)
+        remaining = iter(actions)
+        times.append(wall_time(lambda remaining=remaining: env.step(next(remaining)), device, POLICY_STEPS))
+    return float(np.median(times))
+
+
 def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
     """Measure policy steps per second on a CPU by number of threads, and the speedup from the first number to the last.
 
@@ -177,8 +205,8 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
     """Time solver and environment for numbers of environments, and the parts of a policy step.
 
-    Keys: `solver_` and `env_steps_per_s_<n>`, `<part>_us` and `<part>_share`.
-    envs, train_envs: numbers of environments; parts of a policy step are timed with train_envs.
+    Keys: `solver_` and `env_steps_per_s_<n>`, `env_steps_per_s_policy_<n>`, `<part>_us` and `<part>_share`.
+    envs, train_envs: numbers of environments; parts of a policy step and a policy's jumps are timed with train_envs.
     """
     values: dict[str, float] = {}
     for n in sorted({*envs, train_envs}):
@@ -187,6 +215,7 @@ def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, d
         values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
         if n == train_envs:
             values["env_step_us"] = 1e6 * step
+            values[f"env_steps_per_s_policy_{n}"] = n / time_policy(n, repeats, device)
     parts = time_stages(train_envs, device, repeats)
     values |= {f"{part}_us": 1e6 * wall for part, wall in parts.items()}
     return values | {f"{part}_share": wall / sum(parts.values()) for part, wall in parts.items()}
