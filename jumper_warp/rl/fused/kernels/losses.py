@@ -32,7 +32,7 @@ def actor_loss(
 ):  # fmt: skip
     """Write PPO's actor losses, and their gradients with respect to the network's output and the exploration noise.
 
-    Formulas: see `ppo.actor_gradient`.
+    Losses: see `jumper_warp.rl.torch.ppo.ppo_losses`, whose gradient autograd computes there.
     output, grad_output: (rows, WIDTH), twice the rows with MIRROR, as in `policy_mean`. samples: (…, sample_width), of
     which the rows `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, asymmetry,
     KL, sums over each split as in `weight_gradient`.
@@ -96,7 +96,7 @@ def critic_loss(
 ):  # fmt: skip
     """Write PPO's value loss, and its gradient with respect to the critic's output.
 
-    Formulas: see `ppo.critic_gradient`.
+    Loss: see `jumper_warp.rl.torch.ppo.ppo_losses`, whose gradient autograd computes there.
     output, grad_output: (rows, WIDTH), of which column 0 counts; samples, index, loss_partial: as in `actor_loss`.
     """
     split, col = tl.program_id(0), tl.arange(0, WIDTH)
