@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.evaluation.log import check
-from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_json
 
@@ -79,12 +78,16 @@ def _step(item: Json) -> ScriptStep:
     unknown = sorted(set(item) - {kind} - ({"seconds"} if kind == "walk" else set()))
     check(not unknown, f"{kind} has no {', '.join(unknown)}")
     given = item[kind] if isinstance(item[kind], list) else [item[kind]]
-    values = tuple(real_array(given, kind, float).tolist())
-    fits = len(values) == KINDS[kind] and all(abs(value) <= LIMITS[kind] for value in values)
+    fits = len(given) == KINDS[kind] and all(_is_number(value) and abs(value) <= LIMITS[kind] for value in given)
     check(fits, f"{kind} takes {KINDS[kind]} numbers within {LIMITS[kind]:g}")
     if kind.startswith("jump"):
-        check(kind != "jump_up" or values[0] > 0.0, "jump_up needs a positive height [m]")
-        return ScriptStep(kind, values)
-    seconds = values[0] if kind == "stand" else float(real_array(item.get("seconds", 2.0), "seconds", float))
-    check(0.0 < seconds <= MAX_SECONDS, f"seconds must be positive and at most {MAX_SECONDS:g}")
-    return ScriptStep(kind, values if kind == "walk" else (0.0, 0.0, 0.0), seconds)
+        check(kind != "jump_up" or given[0] > 0.0, "jump_up needs a positive height [m]")
+        return ScriptStep(kind, tuple(map(float, given)))
+    seconds = given[0] if kind == "stand" else item.get("seconds", 2.0)
+    check(_is_number(seconds) and 0.0 < seconds <= MAX_SECONDS, f"seconds must be positive and at most {MAX_SECONDS:g}")
+    return ScriptStep(kind, tuple(map(float, given)) if kind == "walk" else (0.0, 0.0, 0.0), float(seconds))
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether JSON data is a number; a bool is none."""
+    return type(value) in (int, float)

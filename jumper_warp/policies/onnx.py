@@ -18,6 +18,7 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
 from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyError, PolicyInterface
+from jumper_warp.rl.checkpoint import DECODE_ERRORS
 
 OPSET = 18
 IR_VERSION = 9
@@ -150,7 +151,7 @@ def tensors_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[s
     try:
         model.ParseFromString(data)
         tensors = dict(map(_read_tensor, filter(_is_tensor, model.graph.initializer)))
-    except (DecodeError, ValueError) as error:
+    except (DecodeError, *DECODE_ERRORS) as error:
         raise PolicyError(f"the ONNX file cannot be read ({error!s:.100})") from error
     check_tensors(tensors, interface)
     rebuilt = onnx_model(tensors, interface, config)

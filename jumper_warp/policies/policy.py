@@ -9,6 +9,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
@@ -209,7 +210,7 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
         if not file.exists():
             raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config")
         config = read_json(file, "settings of a run", error=CheckpointError)
-        state = checkpoints.load_foreign_checkpoint(path) | {"config": config}
+        state = {"config": config, "saved": checkpoints.load_foreign_checkpoint(path)}
         read = _policy_of_rsl_rl
     elif path.suffix != ".pt" and newest:
         path, state, *_ = checkpoints.latest_checkpoint(path / CHECKPOINTS)
@@ -228,9 +229,10 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
 
 
 def _policy_of_rsl_rl(state: Json) -> Policy:
-    """Return the policy in a checkpoint of rsl-rl 5, to which `config` (`env`, perhaps `train`) is added."""
+    """Return the policy in a checkpoint of rsl-rl 5, `saved`, with the `config` (`env`, perhaps `train`) beside it."""
     config = state["config"]
-    actor = state["actor_state_dict"]
+    saved = state["saved"]
+    actor = saved["actor_state_dict"]
     layers = _actor_layers(actor, "mlp.")
     mean = torch.zeros(layers[0][0].shape[1])
     std = torch.ones_like(mean)
@@ -238,7 +240,7 @@ def _policy_of_rsl_rl(state: Json) -> Policy:
         mean = actor["obs_normalizer._mean"][0]
         std = actor["obs_normalizer._std"][0] + RSL_RL_EPS
     activation = config.get("train", {}).get("ppo", {}).get("activation", "elu")
-    return _policy_of_weights(config, int(state["iter"]), layers, mean, std, activation, RSL_RL_LIMIT)
+    return _policy_of_weights(config, int(saved["iter"]), layers, mean, std, activation, RSL_RL_LIMIT)
 
 
 def _policy_of_checkpoint(state: Json) -> Policy:
@@ -293,10 +295,13 @@ def learning_curve(source: Path) -> bytes | None:
 def thinned_curve(metrics: bytes) -> bytes:
     """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
 
-    The lines are evenly spaced. The first and the last line are included, partial lines are omitted.
+    The lines are evenly spaced. The first and the last line are included, malformed lines are omitted.
     """
-    whole = [json.loads(line) for line in metrics.splitlines() if line.endswith(b"}")]
-    rows = [{name: row[name] for name in CURVE if name in row} for row in whole]
+    rows = []
+    for line in metrics.splitlines():
+        with suppress(InputError, TypeError):
+            row = parse_json(line, METRICS_FILE)
+            rows.append({name: row[name] for name in CURVE if name in row})
     last = len(rows) - 1
     kept = rows if last < CURVE_ROWS else [rows[round(i * last / (CURVE_ROWS - 1))] for i in range(CURVE_ROWS)]
     return "".join(f"{json.dumps(row)}\n" for row in kept).encode()

@@ -8,7 +8,15 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from jumper_warp.utils.checks import ACTIVATIONS, NAME, check_angle_limits, check_filter_speed, check_types
+from jumper_warp.utils.checks import (
+    ACTIVATIONS,
+    MAX_HIDDEN,
+    MAX_WIDTH,
+    NAME,
+    check_angle_limits,
+    check_filter_speed,
+    check_types,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
@@ -85,8 +93,9 @@ class PolicyInterface:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
         if self.physics_dt > self.policy_dt:
             raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise PolicyError(f"hidden must name widths of at least one layer, got {self.hidden!s:.100}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
+            sizes = f"1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}"
+            raise PolicyError(f"hidden must name {sizes}, got {self.hidden!s:.100}")
         _check_filter(self.command_filter)
         _check_layout(self.observation_layout, len(self.observation_names))
         if self.activation not in ACTIVATIONS:
@@ -120,7 +129,7 @@ class PolicyInterface:
             check_types("interface field", interface)
         except PolicyError:
             raise
-        except (InputError, TypeError) as error:
+        except (InputError, TypeError, AttributeError) as error:
             raise PolicyError(f"the interface has a field of another type: {error}") from error
         return interface
 
@@ -129,6 +138,9 @@ def _check_filter(fields: Json) -> None:
     """Raise PolicyError unless a command filter has exactly the fields of `FilterCfg`, with valid values."""
     if set(fields) != {*FILTERED, "horizon", "speed_floor"}:
         raise PolicyError(f"command_filter must have the fields {', '.join(FILTERED)}, horizon, speed_floor")
+    numbers = [fields["horizon"], fields["speed_floor"], *(each for name in FILTERED for each in fields[name].values())]
+    if any(isinstance(number, bool) for number in numbers):
+        raise PolicyError("command_filter must hold numbers")
     try:
         check_filter_speed(fields["horizon"], fields["speed_floor"])
         for name in FILTERED:
@@ -142,14 +154,14 @@ def _check_layout(layout: Json, width: int) -> None:
     first = 0
     for name, term in layout.items():
         where = f"observation_layout {name!r:.60}"
-        if set(term) != set(LAYOUT_FIELDS):
-            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}")
+        if set(term) != set(LAYOUT_FIELDS) or any(type(term[key]) is not int for key in ("first", "end", "history")):
+            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}; first, end and history whole numbers")
         if term["first"] != first or term["end"] <= first or not 1 <= term["history"] <= MAX_HISTORY:
             raise PolicyError(f"{where} must begin at column {first}, with 1 to {MAX_HISTORY} frames")
         if (term["end"] - first) % term["history"]:
             raise PolicyError(f"{where} must hold whole frames")
         for key in ("scale", "clip"):
-            if not 1.0e-6 <= term[key] <= 1.0e6:
+            if isinstance(term[key], bool) or not 1.0e-6 <= term[key] <= 1.0e6:
                 raise PolicyError(f"{where}: {key} must lie in 1e-6 to 1e6, got {term[key]!r:.60}")
         first = term["end"]
     if layout and first != width:

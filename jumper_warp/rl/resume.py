@@ -91,7 +91,7 @@ def saved_init_policy(state: Json) -> str | None:
     try:
         settings = json.loads(state["config"])["train"]
         return str(settings["init_policy"]) if settings.get("init_policy") else None
-    except (LookupError, TypeError, ValueError, AttributeError):
+    except DECODE_ERRORS:
         return None
 
 

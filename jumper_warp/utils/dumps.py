@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from jumper_warp.utils.files import Json, parse_json
 
 FORMAT, VERSION = "jumper-warp dump", 1
 GROUPS = ("rewards", "observations")  # Arrays of the values of all terms, whose names are in the header
+LABEL = re.compile(r"[\w./ -]{1,250}")  # Names of tasks, terms and their components
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
@@ -49,7 +51,7 @@ def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
     """Read a non-finite value and the header from a file that `write_dump` has written in a training.
 
     Raises InputError: the file is missing, damaged, larger than 256 MiB unpacked, of another kind or version, or an
-    array has another type or shape.
+    array has another type or shape, or a name or count is malformed.
     """
     arrays = read_npz(path, "dump of a training")
     try:
@@ -61,8 +63,12 @@ def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
         fits = all(arrays[name].shape == (size,) for name, size in shapes.items())
         if not fits or any(values.dtype.kind not in "biuf" for values in arrays.values()):
             raise InputError("an array has another shape or type")
+        labels = [header["task"], header["term"], *(name for group in GROUPS for name in names[group])]
+        counts = [header["world"], header["step"], header["iteration"], header["config"]["train"]["seed"]]
+        if not all(map(LABEL.fullmatch, labels)) or not all(type(count) is int for count in counts):
+            raise InputError("a name or count is malformed")
         value = float(header["value"])
         found = NonFiniteValue(header["term"], value, header["world"], header["step"], arrays, names)
     except (LookupError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error})") from error
+        raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error!s:.200})") from error
     return found, header

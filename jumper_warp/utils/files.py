@@ -1,5 +1,6 @@
 """Atomic file writes, and bounded reading of regular files and of JSON."""
 
+import itertools
 import json
 import math
 import os
@@ -16,6 +17,8 @@ Json = dict[str, Any]  # Object of JSON data, settings or values by name
 ErrorType = Callable[[str], InputError]
 MAX_BYTES = 256 * 2**20  # Size of the largest file that is read
 MAX_JSON_BYTES = 16 * 2**20  # Size of the largest JSON file that is read
+MAX_DEPTH = 50  # Levels of nested objects and lists in JSON
+MAX_DIGITS = 18  # Characters of an integer in JSON; all these are exact as int64
 
 
 @contextmanager
@@ -100,11 +103,16 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
     """Parse JSON data (UTF-8) and return its content.
 
     where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
-    not JSON, nests too deeply, repeats a key, or has such a number.
+    not JSON, nests deeper than MAX_DEPTH, repeats a key, cannot be encoded as UTF-8, or has such a number or an integer
+    of more than MAX_DIGITS characters.
     """
     hooks: Json = {"parse_constant": _number, "parse_float": _number} if finite else {}
     try:
-        return json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
+        text = data.decode() if isinstance(data, bytes) else data
+        content = json.loads(text, object_pairs_hook=_unique, parse_int=_integer, **hooks)
+        _check_depth(content)
+        json.dumps(content, ensure_ascii=False).encode()  # an escape may be half of a surrogate pair
+        return content
     except json.JSONDecodeError as problem:
         reason = f"line {problem.lineno}: {problem.msg}"
     except (ValueError, RecursionError) as problem:
@@ -126,3 +134,20 @@ def _number(text: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{text:.20} is not a finite number")
     return value
+
+
+def _integer(text: str) -> int:
+    """Convert the text of an integer in JSON to an int. Raises InputError: it is too long."""
+    if len(text) > MAX_DIGITS:
+        raise InputError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _check_depth(content: Any) -> None:
+    """Raise InputError if lists and objects of JSON data are nested deeper than MAX_DEPTH."""
+    level = [content]
+    for _ in range(MAX_DEPTH + 1):
+        parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
+        level = list(itertools.chain.from_iterable(parts))
+    if level:
+        raise InputError(f"more than {MAX_DEPTH} levels")

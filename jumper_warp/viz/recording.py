@@ -127,7 +127,8 @@ def load_npz(path: Path) -> Recording:
         _check_names(recording)
         return recording
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
+        reason = f"{type(error).__name__}: {error!s:.200}"
+        raise RecordingError(f"{path}: cannot be read as a recording ({reason})") from error
 
 
 def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:

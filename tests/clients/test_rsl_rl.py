@@ -93,3 +93,7 @@ def test_checkpoint_without_the_environments_configuration_is_refused(trained, t
     path.with_name("config.json").write_text("{")
     with pytest.raises(CheckpointError, match=r"config\.json: not JSON"):
         Policy.load(path)
+    path.with_name("config.json").write_text("{}")
+    torch.save([1], path)
+    with pytest.raises(CheckpointError, match=r"model_7\.pt: not a training checkpoint"):
+        Policy.load(path)

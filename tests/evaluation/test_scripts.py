@@ -35,7 +35,7 @@ def test_example_script_walks_and_jumps():
 @pytest.mark.parametrize(
     "command",
     [{"stand": True}, {"jump_up": "0.9"}, {"walk": [0, 0, 1], "seconds": "2"}, {"walk": [0, 0]}, {"jump_up": 10**400},
-     {"jump_to": [[1, 0]]}, {"stand": float("nan")}, {"fly": 1}, [], None],
+     {"jump_to": [[1, 0]]}, {"stand": float("nan")}, {"fly": 1}, [], None, {"walk": [0, True, 1]}],
 )  # fmt: skip
 def test_command_of_another_type_is_refused_by_its_number(command):
     with pytest.raises(InputError, match="command 2") as refusal:

@@ -14,5 +14,6 @@ def test_thinned_curve_keeps_its_columns_and_evenly_spaced_rows():
     assert (kept[0]["iteration"], kept[-1]["iteration"]) == (0, 999) and gaps <= {16, 17}  # 999 / 59 = 16.9
 
 
-def test_thinned_curve_keeps_short_curves_and_drops_partial_lines():
-    assert thinned_curve(b'{"iteration": 1}\n{"iteration": 2}\n{"itera') == b'{"iteration": 1}\n{"iteration": 2}\n'
+def test_thinned_curve_keeps_short_curves_and_drops_malformed_lines():
+    valid = b'{"iteration": 1}\n{"iteration": 2}\n'
+    assert thinned_curve(valid + b'}\n\xff}\n{"itera') == valid

@@ -20,6 +20,7 @@ from jumper_warp.utils import assets
 from jumper_warp.utils.assets import policy_tasks
 
 FILTER = dataclasses.asdict(vertical_jump_filter())
+TERM = {"first": 0, "end": 1, "scale": 1.0, "clip": 1.0, "history": 1}
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -189,12 +190,30 @@ def change_model(change):
     return changed
 
 
+def first_bias(model):
+    """Return the initialiser of the first layer's bias."""
+    return next(tensor for tensor in model.graph.initializer if tensor.name == "actor_0_bias")
+
+
 def set_nan(model):
     """Write NaN into the first bias."""
-    bias = next(tensor for tensor in model.graph.initializer if tensor.name == "actor_0_bias")
+    bias = first_bias(model)
     bias.CopyFrom(onnx.numpy_helper.from_array(np.full(64, np.nan, np.float32), bias.name))
 
 
+def set_first(**changes):
+    """Return a function that changes fields of a model's first bias."""
+    return lambda model: [setattr(first_bias(model), name, value) for name, value in changes.items()]
+
+
+def reshape_block(model):
+    """Declare the first bias a repeated block with three dimensions."""
+    bias = first_bias(model)
+    bias.name = "actor_0_block"
+    bias.dims.extend([1, 1])
+
+
+NOT_UTF8 = b"\x3a\x06\x2a\x04\x42\x02\xff\xfe"  # Model with a graph (7) with an initialiser (5) with a name (8)
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: no such file"),
@@ -208,6 +227,12 @@ REFUSALS = {
         change_model(lambda m: [setattr(weight, "data_location", 1) for weight in m.graph.initializer]),
         "is in another file",
     ),
+    "weights of 4 bits": (change_model(set_first(data_type=22)), "the ONNX file cannot be read"),
+    "weights of an unknown type": (change_model(set_first(data_type=99)), "the ONNX file cannot be read"),
+    "block of three dimensions": (change_model(reshape_block), "the ONNX file cannot be read"),
+    "name that is not UTF-8": (change_model(lambda m: m.MergeFromString(NOT_UTF8)), "the ONNX file cannot be read"),
+    "layout of another type": (edit_config(lambda c: c["interface"].update(observation_layout=[])), "of another type"),
+    "number beyond float64": (edit_config(lambda c: c["interface"].update(policy_dt=10**400)), "401 digits"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
@@ -244,6 +269,11 @@ def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
         ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
         ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
+        ({"hidden": (65537,)}, "hidden must name 1 to 64 widths from 1 to 65536"),
+        ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
+        ({"command_filter": FILTER | {"horizon": True}}, "command_filter must hold numbers"),
+        ({"observation_layout": {"a": TERM | {"end": 3, "history": 1.5}}}, "first, end and history whole numbers"),
+        ({"observation_layout": {"a": TERM | {"clip": True}}}, "clip must lie in"),
     ],
 )
 def test_refuses_an_invalid_interface(change, message):
