@@ -108,7 +108,7 @@ class WholeBody:
         """Return rotation, position, velocity and angular velocity of the base, world frame.
 
         Rotation (..., 3, 3), origin [m], its velocity [m/s], angular velocity [rad/s]. Arguments q (..., 19), qd (...,
-        18). Vectors: (..., 3), world frame.
+        18), whose first entries are the velocity of the base link's centre of mass. Vectors: (..., 3), world frame.
         """
         rotation = rotation_matrices(q[..., 3:7])
         ang = qd[..., 3:6]

@@ -89,7 +89,10 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
 
 def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
     """Return the bytes of a regular file; arguments and errors are those of `existing_file`."""
-    return existing_file(path, purpose, limit, error).read_bytes()
+    try:
+        return existing_file(path, purpose, limit, error).read_bytes()
+    except OSError as problem:  # such as a file of the kernel that has no content
+        raise error(f"{path}: cannot be read: {problem} ({purpose})") from None
 
 
 def read_json(

@@ -240,7 +240,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
     """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - base deceleration / limit [m/s^2])."""
     if not just_landed(state):
         return 0.0
-    return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
+    return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)  # which is at most 0
 
 
 @wp.func

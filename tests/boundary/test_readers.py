@@ -62,6 +62,14 @@ def test_file_that_is_not_regular_is_refused(damaged, make):
         read()
 
 
+def test_file_whose_reading_fails_is_refused_in_one_line(damaged):
+    path, read = damaged
+    path.symlink_to("/proc/self/mem")
+    with pytest.raises(InputError) as refusal:
+        read()
+    assert path.name in str(refusal.value) and "\n" not in str(refusal.value)
+
+
 @pytest.mark.parametrize("name", ["dump.npz", "motion.npz", "recording.npz"])
 def test_archive_is_refused_before_it_is_unpacked_to_gigabytes(name, tmp_path):
     path = tmp_path / name
