@@ -35,7 +35,7 @@ def actor_loss(
     Losses: see `jumper_warp.rl.torch.ppo.ppo_losses`, whose gradient autograd computes there.
     output, grad_output: (rows, WIDTH), twice the rows with MIRROR, as in `policy_mean`. samples: (…, sample_width), of
     which the rows `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, asymmetry,
-    KL, sums over each split as in `weight_gradient`.
+    KL, sums over each split as in `layers.weight_gradients`.
     """
     split, action = tl.program_id(0), tl.arange(0, WIDTH)
     first = split * rows_per_split

@@ -5,7 +5,7 @@ import triton.language as tl
 
 from jumper_warp.rl.fused.kernels.scalar import INFINITY, finite_or_zero
 
-LOG_BETA_1 = tl.constexpr(-0.10536051565782628)  # log of `flat.BETAS`
+LOG_BETA_1 = tl.constexpr(-0.10536051565782628)  # log of 0.9, decay of the first moment in `torch.optim.Adam`
 LOG_BETA_2 = tl.constexpr(-0.0010005003335835335)
 
 
