@@ -69,6 +69,9 @@ TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff
 PAW_RADIUS = 0.025  # [m] Radius of a paw
 
 
+# ---------------------------------------------------------------------- replay in the simulation
+
+
 class MotionReplay:
     """One world of the simulation that trains policies, in single precision, driven by the targets of a motion.
 
@@ -245,6 +248,9 @@ POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0
 SCATTER = 0.35  # [1] Standard deviation of these postures
 
 
+# ---------------------------------------------------------------------- first guesses
+
+
 def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
     """Return random candidates of squat jumps: actions [1], (count, len(knots)), two postures, then extension.
 
@@ -287,6 +293,9 @@ def noisy_variants(solution: np.ndarray, knots: Knots, rng: np.random.Generator)
     actions[: len(solution) // 4] = solution.reshape(-1, 4)
     spread = np.linspace(0.0, 0.2, 64)[:, None]
     return np.clip(actions.ravel() + spread * rng.normal(size=(64, actions.size)), -1.0, 1.0)
+
+
+# ---------------------------------------------------------------------- the jumps
 
 
 @dataclass(frozen=True)
@@ -427,6 +436,9 @@ LIMITED = {
     )
     for name, (label, changed) in LIMITS.items()
 }
+
+
+# ---------------------------------------------------------------------- search and report
 
 
 def optimise(

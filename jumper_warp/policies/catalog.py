@@ -140,7 +140,7 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
     for name in {CONFIG: "", ONNX: "", **saved, **updating}:
         if not FILE_NAME.fullmatch(name):
             raise PolicyError(f"{path}: names a file {name!r:.60}")
-        if (name.endswith(PICTURES) or name not in saved) and not (folder / name).exists():
+        if (name.endswith(PICTURES) or name not in saved) and not os.path.lexists(folder / name):
             continue
         files[name] = read_file(folder / name, PURPOSE, error=PolicyError)
         if hashlib.sha256(files[name]).hexdigest() not in (saved.get(name), updating.get(name)):
@@ -230,7 +230,7 @@ def summarise(folder: Path) -> PolicySummary:
     try:
         files = read_files(folder)
         interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG])["interface"])
-        if METRICS not in files and (folder / METRICS).exists():
+        if METRICS not in files and os.path.lexists(folder / METRICS):
             raise PolicyError(f"{METRICS} is not in {MANIFEST}")
         readme = folder / README
         if os.path.dirname(os.path.realpath(readme)) != os.path.realpath(folder):

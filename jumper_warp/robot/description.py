@@ -34,7 +34,7 @@ RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 def load_description(path: Path = DEFAULT_DESCRIPTION) -> RobotDescription:
     """Read a robot description, by default the project's own: a JSON file and the URDF that it names.
 
-    Each is read once. The values of the files are taken as they are; tests check those of the project.
+    Each is read once. Their values are not checked here; tests check the project's files.
     """
     table = json.loads(path.read_text(encoding="utf-8"))
     urdf = UrdfReader(path.parent / table["urdf"])

@@ -44,6 +44,9 @@ JOINTS = ("lateral", "outer", "outer_knee", "inner", "inner_knee")
 ALONE = "this robot alone, besides shapes and sites"
 
 
+# ---------------------------------------------------------------------- ranges of worlds and the kernel of a step
+
+
 class NotThisRobotError(InputError):
     """Error raised for a Newton model whose bodies, joints or shapes are not those of this robot."""
 
@@ -83,6 +86,9 @@ def advance_kernel(
     if device.is_cuda if by_legs is None else by_legs:
         return modules.advance_legs.advance_legs_kernel, 32 if device.is_cuda else 4
     return modules.advance.advance_kernel, 32 if device.is_cuda else 1
+
+
+# ---------------------------------------------------------------------- the robot's parts in a model
 
 
 def check_model(model: Model) -> None:
@@ -205,6 +211,9 @@ def state_arrays(state: State | Model) -> KernelStruct:
     for name in StateArrays.vars:
         setattr(arrays, name, getattr(state, name))
     return arrays
+
+
+# ---------------------------------------------------------------------- parameter table, launches, resets
 
 
 class JumperDynamics:

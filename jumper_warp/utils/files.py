@@ -114,7 +114,8 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
         text = data.decode() if isinstance(data, bytes) else data
         content = json.loads(text, object_pairs_hook=_unique, parse_int=_integer, **hooks)
         _check_depth(content)
-        json.dumps(content, ensure_ascii=False).encode()  # an escape may be half of a surrogate pair
+        if "\\u" in text:  # an escape may be half of a surrogate pair
+            json.dumps(content, ensure_ascii=False).encode()
         return content
     except json.JSONDecodeError as problem:
         reason = f"line {problem.lineno}: {problem.msg}"

@@ -25,7 +25,7 @@ from simulation_helpers import (
     tilted,
     write_state,
 )
-from solver_helpers import BODIES, Reference, States, random_states
+from solver_helpers import BODIES, Flight, Reference, States, random_states
 
 DT = 1.0 / 480.0
 BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])
@@ -189,6 +189,13 @@ def test_stops_solve_a_quadratic_program():
     assert changed > 5
 
 
+def spring_energy(angles):
+    """Return the energy [J] of the springs of all stops, (n,); angles [rad]: (n, 12)."""
+    bounded = angles @ BOUNDED.T
+    inside = np.maximum(np.maximum(LOWER - bounded, bounded - UPPER), 0.0)
+    return 0.5 * LIMIT_STIFFNESS * (inside**2).sum(axis=1)
+
+
 @pytest.mark.parametrize("falling", [False, True])
 def test_stops_add_no_energy(falling):
     """One step with stops leaves no more kinetic and stop-spring energy than one without stops and contact."""
@@ -207,16 +214,39 @@ def test_stops_add_no_energy(falling):
     freely = StopSteps(n, stops=False).run(states)
     freely.pos[:] = ended.pos
     reference = Reference(stopping.model)
-
-    def spring(angles):
-        """Return the energy [J] of the stops' springs, (n,)."""
-        bounded = angles @ BOUNDED.T
-        inside = np.maximum(np.maximum(LOWER - bounded, bounded - UPPER), 0.0)
-        return 0.5 * LIMIT_STIFFNESS * (inside**2).sum(axis=1)
-
-    held = spring(states.angles + DT * ended.rates) - spring(states.angles)
+    held = spring_energy(states.angles + DT * ended.rates) - spring_energy(states.angles)
     gained = np.array([reference.energy(ended, i) - reference.energy(freely, i) for i in range(n)]) + held
     landed = stopping.dynamics.work.impulse.numpy()[..., Z].max(axis=0) > 0.0
     assert landed.mean() > 0.8 if falling else not landed.any()
     assert gained.max() < 1.0e-6  # [J]
     assert np.median(gained) < -0.1
+
+
+@pytest.mark.parametrize(("double", "rounding"), [(False, 1.0e-4), (True, 1.0e-9)])
+def test_robots_without_motors_gain_no_energy_in_any_step(double, rounding):
+    """Legs reach 38 rad/s; beyond 50 rad/s they turn so far in a step that its discretisation may gain energy."""
+    n = 40
+    states = random_states(n, 3, joint_rate=4.0)
+    tilts = np.random.default_rng(1).normal(size=(n, 3)) * [0.3, 0.3, 1.0]  # [rad]
+    states.quat[:] = Rotation.from_euler("xyz", tilts).as_quat()
+    sim = simulation(n)
+    write_state(sim, states.joint_q().reshape(n, -1))
+    states.pos[:, Z] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., Z].min(axis=1)  # a paw in the ground is pushed out
+    model = build_model(n, visuals=False, device="cpu")
+    robots, reference = Flight(model, double=double), Reference(model)
+
+    def energy(states):
+        """Return kinetic and potential energy of robots and of the springs of their stops [J], (n,)."""
+        return np.array([reference.energy(states, i) for i in range(n)]) + spring_energy(states.angles)
+
+    start = before = energy(states)
+    gained, fastest = -np.inf, 0.0
+    for _ in range(120):
+        states = robots.run(states, DT)
+        after = energy(states)
+        gained = max(gained, (after - before).max())
+        fastest = max(fastest, np.abs(states.rates).max())
+        before = after
+    assert gained < rounding  # [J]
+    assert np.median(start - before) > 10.0
+    assert 30.0 < fastest < 50.0  # [rad/s]
