@@ -151,8 +151,11 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
 def write_files(folder: Path, files: Mapping[str, bytes], old: Mapping[str, bytes]) -> None:
     """Write files of a policy (name to content) and its manifest; old: the folder's files, which the manifest keeps.
 
-    Raises OSError: the disk is full or the folder cannot be written.
+    Raises PolicyError: a name is not that of a file in a folder. OSError: the disk is full or the folder cannot be
+    written.
     """
+    if wrong := [name for name in files if not FILE_NAME.fullmatch(name)]:
+        raise PolicyError(f"{folder}: a policy cannot hold a file {wrong[0]!r:.60}")
     present = {name: hashlib.sha256(data).hexdigest() for name, data in old.items()}
     written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": present}

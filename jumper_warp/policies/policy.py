@@ -185,8 +185,15 @@ class Policy(nn.Module):
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
-    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `Policy.load`."""
-    return Policy.load(name).to(device)
+    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `Policy.load`.
+
+    Raises InputError: there is no such device.
+    """
+    policy = Policy.load(name)
+    try:
+        return policy.to(torch.device(device))
+    except (RuntimeError, TypeError, AssertionError) as error:  # AssertionError: torch has no CUDA
+        raise InputError(f"no device {device!r:.60} ({one_line_message(error):.100})") from error
 
 
 def _named(layers: Weights, mean: torch.Tensor, std: torch.Tensor) -> dict[str, torch.Tensor]:
