@@ -45,7 +45,7 @@ from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_m
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
-from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.rl.run_names import CHECKPOINTS
 from jumper_warp.tasks import saving
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
