@@ -56,9 +56,9 @@ def start(args: Args, seed: int) -> tuple[DeviceStream, Learner]:
 def run_parts(members: list[tuple[DeviceStream, Learner]], names: tuple[str, ...]) -> float:
     """Run parts of an iteration of all seeds, and return the time until the device has finished [s]."""
     begin = time.perf_counter()
-    for stream, learner in members:
-        with stream:
-            for name in names:
+    for name in names:
+        for stream, learner in members:
+            with stream:
                 getattr(learner, name)()
     wp.synchronize()
     return time.perf_counter() - begin
@@ -72,7 +72,7 @@ def time_seeds(args: Args, count: int) -> dict[str, float]:
     blocks = [[run_parts(members, PARTS) for _ in range(args.iterations)] for _ in range(args.repeats)]
     values = {f"iteration_{count}_s": statistics.median(statistics.fmean(block) for block in blocks)}
     parts = [[run_parts(members, (name,)) for name in PARTS] for _ in range(args.iterations)]
-    values |= {f"{name}_{count}_s": statistics.median(times) for name, times in zip(PARTS, zip(*parts), strict=True)}
+    values |= {f"{name}_{count}_s": statistics.median(times[i] for times in parts) for i, name in enumerate(PARTS)}
     if memory := device_memory(wp.get_device(args.device)):
         values[f"memory_{count}_gib"] = memory / 2**30
     for _, learner in members:

@@ -1,11 +1,14 @@
-"""`jumper list`: list all tasks and the project's policies, one a line."""
+"""`jumper list`: list all tasks and the project's policies, one a line; `jumper list runs`: list trainings."""
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -30,8 +33,19 @@ class ListCfg:
     json: bool = False  # Print JSON
 
 
+@dataclass(frozen=True)
+class RunsCfg:
+    """List the trainings in a log folder, the newest first."""
+
+    log_root: Path = Path("logs")  # Folder of all runs
+    json: bool = False  # Print JSON
+
+
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print tasks and policies, one a line; modules: loaded by --task-module, with their tasks registered."""
+    """Print tasks and policies, or with `runs` the trainings, one a line; modules: loaded by --task-module."""
+    if args[:1] == ["runs"]:
+        print_runs(parse(RunsCfg, "list runs", args[1:]))
+        return
     cfg = parse(ListCfg, "list", args)
     from jumper_warp.policies.catalog import summarise
     from jumper_warp.utils.assets import POLICIES, policy_tasks
@@ -101,6 +115,61 @@ def print_tables(tasks: Sequence[Json], policies: Sequence[PolicySummary]) -> No
         table.add_row(policy.name, policy.task, success, quantity(policy.error), size_text(policy.size_bytes))
     print_table(table)
     print("", LEGEND, sep="\n")
+
+
+def describe_run(folder: Path) -> Json:
+    """Return a training's name, task, start, seeds, success, iteration, commit, tags and folder as JSON data.
+
+    success: last logged one, mean over seeds; None: not logged. Raises InputError: its configuration is unreadable.
+    """
+    from jumper_warp.rl.metrics_file import METRICS_FILE
+    from jumper_warp.rl.run_names import last_metrics, seed_folders, start_time, title
+    from jumper_warp.utils.files import read_json
+
+    folders = list(seed_folders(folder).values()) or [folder]
+    configs = [read_json(each / "config.json", "settings of a run") for each in folders]
+    lines = [last_metrics(each, METRICS_FILE) for each in folders]
+    known = [value for line in lines if (value := line.get("Metrics/success")) is not None]
+    train = configs[0]["train"]
+    return {
+        "name": title(folder),
+        "task": train["task"],
+        "started": start_time(folder),
+        "seeds": [config["train"]["seed"] for config in configs],
+        "success": sum(known) / len(known) if known else None,
+        "iteration": max(int(line.get("iteration") or 0) for line in lines),
+        "commit": (configs[0].get("commit") or {}).get("hash"),
+        "tags": list(train.get("tags", ())),
+        "folder": str(folder),
+    }
+
+
+def print_runs(cfg: RunsCfg) -> None:
+    """Print a table, or JSON data, of the trainings in a log folder; folders without readable settings are left out."""
+    from rich.table import Column, Table
+
+    from jumper_warp.utils.errors import InputError
+    from jumper_warp.utils.progress import format_duration
+    from jumper_warp.utils.tables import print_table
+
+    runs = []
+    for folder in cfg.log_root.glob("*/*/"):
+        with suppress(InputError, LookupError, TypeError):
+            runs.append(describe_run(folder))
+    runs.sort(key=lambda run: run["started"], reverse=True)
+    if cfg.json:
+        print(json.dumps(runs, indent=2))
+        return
+    right = {"justify": "right", "no_wrap": True}
+    names = [Column("RUN", overflow="fold"), "task", *(Column(name, **right) for name in ("age", "seeds", "success"))]
+    table = Table(*names, "commit", "tags", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for run in runs:
+        success = "" if run["success"] is None else f"{100.0 * run['success']:.1f} %"
+        seeds = ", ".join(map(str, run["seeds"]))
+        age = format_duration(time.time() - run["started"])
+        commit = (run["commit"] or "")[:8]
+        table.add_row(run["name"], run["task"], age, seeds, success, commit, ", ".join(run["tags"]))
+    print_table(table)
 
 
 def quantity(metric: Json | None) -> str:

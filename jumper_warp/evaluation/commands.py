@@ -19,6 +19,7 @@ from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.skills import SkillNames
 from jumper_warp.policies.catalog import add_files, find_policy, is_run, run_folder
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.rl.run_names import title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import MetricValue
@@ -174,8 +175,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 def played_name(source: str | Path) -> str:
     """Return the name of a policy for titles, or "run RUN" for the folder or a checkpoint of the training run RUN."""
-    name = run_folder(Path(source)).resolve().name
-    return f"run {name}" if is_run(source) else name
+    folder = run_folder(Path(source))
+    return f"run {title(folder)}" if is_run(source) else folder.resolve().name
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,8 @@ class Stopwatch:
 class TrainingConsole:
     """Context manager of the terminal's lines and progress bar of a training."""
 
+    brief = False  # Whether the end of a training is left out, since it is printed for all seeds together
+
     def __init__(self, cfg: TrainCfg, iteration: int = 0, expected_rate: float = 0.0) -> None:
         """Prepare the terminal; cfg: of the training. iteration: iterations so far.
 
@@ -151,6 +153,8 @@ class SeedsConsole(TrainingConsole):
 
 class SeedConsole:
     """Console of one of several seeds: its lines begin with the seed, its metrics are shown with those of others."""
+
+    brief = True
 
     def __init__(self, console: SeedsConsole, seed: int) -> None:
         """Write to the console of all seeds."""

@@ -113,9 +113,10 @@ def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda:
             for run in runs:
                 opened.enter_context(run.open())
             while active := [run for run in runs if not run.ended]:
-                for run in active:
-                    with run.stream:
-                        run.launch()
+                for part in (TrainingRun.collect, TrainingRun.update):  # the same kernels of all runs fill a GPU best
+                    for run in active:
+                        with run.stream:
+                            part(run)
                 stop.can_abort = False
                 ends = [run.is_end_requested(stop) for run in active]
                 for run in active:
@@ -251,14 +252,20 @@ class TrainingRun:
                 self.log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
             yield
 
-    def launch(self) -> None:
-        """Enqueue an iteration on the device."""
+    def collect(self) -> None:
+        """Enqueue the rollout of an iteration on the device."""
         self._watch.start()
         self.ppo.set_progress(self.clock.progress(self.iteration))
-        self.ppo.iterate(self._mark)
+        self.ppo.collect()
+        self._mark()
+
+    def update(self) -> None:
+        """Enqueue the update of an iteration on the device."""
+        self.ppo.update()
+        self._mark()
 
     def conclude(self, stop: StopRequest, ends: bool) -> None:
-        """Count the iteration that was launched; log and save it where it is due. ends: whether it is the last one."""
+        """Count the iteration that was enqueued; log and save it where it is due. ends: whether it is the last one."""
         cfg, log, watch = self.cfg, self.log, self._watch
         self.iteration += 1
         if self.iteration == self._first_iteration:
@@ -276,8 +283,8 @@ class TrainingRun:
             log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
         elif self.iteration == self._first_iteration or not self._is_timed:
             self._print_speed(self.iteration == self._first_iteration)
-        if is_last and not self.failure:
-            log.print_line(f"ended by {self._reason(stop)}")
+        if is_last and not self.failure and not self._console.brief:
+            log.print_line(f"ended by {self.reason(stop)}")
         if (is_last or saves) and self._is_finite:
             self._save(is_last, stop)
         self._seconds = time.perf_counter() - self._begin
@@ -297,7 +304,7 @@ class TrainingRun:
         """Return the number of environment steps in an iteration, of all worlds."""
         return self.cfg.ppo.num_steps * self.cfg.num_envs
 
-    def _reason(self, stop: StopRequest) -> str:
+    def reason(self, stop: StopRequest) -> str:
         """Return a text about why the training ends, with the steps made if they are not all."""
         done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
         steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
@@ -374,7 +381,7 @@ class TrainingRun:
             self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         self._scores.clear()
-        if is_last:
+        if is_last and not self._console.brief:
             hint = f", continue with: {self.resume_command}"
             self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 

@@ -69,7 +69,9 @@ def train(
 
         stop = iterate(runs, after_iteration)
         results = {run.cfg.seed: run.result() for run in runs}
-        for line in table(results, cfg.best_metric):
+        hint = f", continue with: {runs[0].resume_command}" if stop.requested else ""
+        lines = [f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}", *table(results, cfg.best_metric)]
+        for line in lines:
             console.print_line(line)
         return finish(_total(folder, results), runs, stop)
 

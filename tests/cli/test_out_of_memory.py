@@ -43,7 +43,7 @@ def test_training_reports_its_number_of_worlds_while_it_builds(capsys, monkeypat
 
 def test_training_resumes_after_it_ran_out_of_memory(capsys, monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
-        fail_with(patch, Ppo, "iterate", ERRORS[0], calls=2)
+        fail_with(patch, Ppo, "update", ERRORS[0], calls=2)
         code, _, err = run(capsys, "train", *ARGS, "--log-root", str(tmp_path))
     (folder,) = (tmp_path / "vertical-jump").iterdir()
     assert code == 1 and err[-1].endswith(f" --resume {folder}") and "continue from the last checkpoint" in err[-1]
