@@ -1,7 +1,9 @@
 """Record of a few recomputed physics steps, for the reverse pass of a rollout with a thread per leg.
 
-`get_*` and `put_*` read and write the fields of one entry (a step) and world; indices of world and leg come last for
-coalesced access.
+The reverse pass needs values of every step, such as inverse inertias, that would take too much memory for a whole
+rollout: the steps of a few trajectory rows at a time are recomputed and recorded here. `get_*` and `put_*` read and
+write the fields of one entry (a step) and world; indices of world and leg come last for coalesced access. A multiplier
+is a solution of the step's transposed equations, one number per equation (`step_adjoint`).
 """
 
 import warp as wp
