@@ -115,7 +115,13 @@ class TaskRuntime:
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
 
     def _allocate_non_finite(self, slices: int) -> None:
-        """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms."""
+        """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms.
+
+        Kernels replace NaN and infinity by 0, so that training continues. They store the first such value of each term,
+        with its world's state, which `non_finite` reports. Terms are numbered as in `_term_names`: rewards, curriculum,
+        state (diverged), observations. A slice is a range of worlds that one CPU thread advances: records of its own
+        need no atomic operations.
+        """
         task = self.task
         groups = self.task.groups
         slots = [(group, slot.term) for group in groups for slot in task.params.slots[f"observations.{group}"]]

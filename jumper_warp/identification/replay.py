@@ -1,4 +1,7 @@
-"""Replay of recorded motor targets in parallel worlds with different robots and initial states, in double precision."""
+"""Replay of recorded motor targets in parallel worlds with different robots and initial states, in double precision.
+
+Finite differences of the motions give Jacobians; in single precision rounding would dominate them.
+"""
 
 from __future__ import annotations
 
@@ -133,7 +136,9 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
     """Return masses, joints and friction of N robots as the table that the kernels read, (321, N).
 
-    Rows as in `kernels.layout`; nominal: as described, (321, 1).
+    Rows as in `kernels.layout`; nominal: as described, (321, 1). A link's moments are mass, first and second moment
+    about its origin: all scale with its mass. For the base, second moments about its centre of mass scale with the mass
+    and with `base_inertia`, and are then shifted to the origin.
     """
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass = robots.base_mass[:, 0]

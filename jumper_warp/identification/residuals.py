@@ -211,6 +211,7 @@ class MotionResiduals:
         fraction = (self._grid_row - low)[:, None, None]
 
         def at_rows(values: np.ndarray) -> np.ndarray:
+            """Interpolate replayed values (R, ...) linearly to the times of the measured rows, (n, ...)."""
             return values[low] if not fraction.any() else (1.0 - fraction) * values[low] + fraction * values[high]
 
         columns = []
@@ -230,7 +231,8 @@ class MotionResiduals:
         """Assign each unknown that a finite difference perturbs to one of the parallel worlds.
 
         Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
-        unknown of the four legs shares a world.
+        unknown of the four legs shares a world, which saves three of four simulations. Unknowns without effect, and
+        those that contact determines, get no world; their columns of the Jacobian are 0.
         """
         size = len(self.parameters)
         single = []

@@ -73,6 +73,7 @@ class _Descent:
     """State of an optimisation by the augmented Lagrangian method, for all starts in parallel."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, step: float, seed: int):
+        """Place all starts at `begin` (starts, n), without curvature, multipliers or best points; see `minimise`."""
         real = torch.float64 if problem.double else torch.float32
         self.problem = problem
         device = str(problem.rollout(len(begin)).device)

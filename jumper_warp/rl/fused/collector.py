@@ -1,4 +1,8 @@
-"""Rollout collection with the fused kernels, which stores observations as normalised inputs of actor and critic."""
+"""Rollout collection with the fused kernels, which stores observations as normalised inputs of actor and critic.
+
+Inputs ("features") are normalised once, when they are observed, instead of in each of the update's epochs. A sample is
+one world in one policy step. Padding with zeros gives matrices the widths that the kernels need.
+"""
 
 from __future__ import annotations
 
