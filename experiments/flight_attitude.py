@@ -64,6 +64,7 @@ class FlightLog(EvaluationLog):
     spacing = 1.6
 
     def __post_init__(self) -> None:
+        """Allocate results of one flight per world, NaN or -1 until they are known."""
         n = self.count = len(self.apex)
         self.step_dt = 1.0 / 60.0  # [s] policy step; `begin` sets that of the environment
         self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way
@@ -303,6 +304,7 @@ class FlightRun(Run):
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:
+            """Return the actions of jump (policy or fixed takeoff) and turn, (2, num_envs, 12)."""
             jump = None if self.landing is None else self.landing.act(env.skills[JUMP].obs["actor"])
             action = torch.as_tensor(self.flights.action(scale, jump), dtype=torch.float32, device=env.device)
             return torch.stack([action, self.turn.act(env.skills[TURN].obs["actor"])])
@@ -352,6 +354,7 @@ class Args(EvaluationArgs):
     """[m] Lowest and highest base height commanded to the policy that lands."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a takeoff by a policy without a policy."""
         super().__post_init__()
         if self.takeoff == "policy" and not self.landing_policy:
             raise InputError("takeoff by a policy needs one: --landing-policy")

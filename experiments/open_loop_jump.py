@@ -48,6 +48,7 @@ class Args(DeviceArgs):
     robot: Path | None = None  # Robot overlay, as `jumper sysid` writes it, in place of springs
 
     def __post_init__(self) -> None:
+        """Raise InputError if springs are given twice: by flags, and by a robot overlay."""
         if self.spring is not None and self.robot is not None:
             raise InputError("give springs or a robot, which may have springs")
 

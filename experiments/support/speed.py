@@ -115,6 +115,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     check_standing(sim, 0.40)
 
     def advance(worlds: WorldRange) -> None:
+        """Advance a range of worlds by one policy step at constant targets; one CPU thread runs it."""
         sim.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
     graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # the graph does not keep its arrays alive
@@ -128,6 +129,7 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
     count = 0
 
     def step() -> None:
+        """Run one policy step with the next of the random actions."""
         nonlocal count
         env.step(actions[count % len(actions)])
         count += 1
@@ -240,6 +242,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     stopwatch = Stopwatch(env.device)
 
     def iterate() -> None:
+        """Run one PPO iteration, and stop the time of each of its parts."""
         stopwatch.start()
         ppo.iterate(mark=stopwatch.mark)
 

@@ -24,6 +24,7 @@ class SquatLog(EvaluationLog):
     row_name = "squat"
 
     def __post_init__(self) -> None:
+        """Prepare empty lists, which get an array per policy step."""
         self.count = len(self.goals)
         self.step_dt = 1.0 / 60.0
         self.ended = np.zeros(self.count, dtype=bool)  # (num_envs,) whether each episode has ended

@@ -53,6 +53,7 @@ class LegThreadReverse:
         threads = -(-num // 8) * 8
 
         def launch(kernel: Kernel, dim: tuple[int, ...], *inputs: object) -> None:  # over dim and the four legs
+            """Launch a kernel over `dim` and the four legs, in blocks of whole warps."""
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
         for end in range(rows.q.shape[0] - 1, 0, -SPAN):

@@ -297,6 +297,7 @@ class Env(Stages):
         self.skills[skill].params.set(name, value)
 
     def _check_skill(self, skill: int) -> None:
+        """Raise InputError unless `skill` is the index of one of the environment's tasks."""
         if not isinstance(skill, Integral) or not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill!r:.40}")
 
@@ -362,6 +363,7 @@ class Env(Stages):
             array.assign(host_values)
 
     def _array(self, values: np.ndarray) -> wp.array:
+        """Copy values to a float array on the environment's device, for a kernel launch."""
         return wp.array(values, dtype=float, device=self.wp_device)
 
     @locked

@@ -250,6 +250,7 @@ class Stages(Uncopied):
             wp.to_torch(array).masked_fill_(begun, 0.0)
 
     def _advance_rng(self, mask: wp.array) -> None:
+        """Increment the step count of masked worlds, so that their next reset draws other random numbers."""
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
     def _observe(self, part: WorldSlice, after_reset: int) -> None:

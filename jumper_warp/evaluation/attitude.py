@@ -60,6 +60,7 @@ class AttitudeLog(EvaluationLog):
     spacing = 1.5
 
     def __post_init__(self) -> None:
+        """Allocate an outcome per world, before the first policy step."""
         self.turns, self.count = real_array(self.turns, "turns", float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment
@@ -177,6 +178,7 @@ class AttitudeFlags:
     seconds: float = 5.0  # [s] Length of every turn's episode
 
     def __post_init__(self) -> None:
+        """Raise InputError for a number of turns, angle or duration out of range."""
         if self.num_turns < len(DIRECTIONS):
             raise InputError(f"num_turns must be at least {len(DIRECTIONS)}, got {self.num_turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
@@ -201,6 +203,7 @@ class AttitudePlayFlags:
     length = 4.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
+        """Raise InputError for an angle [deg] out of range."""
         check(0.0 < self.angle <= 180.0, f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:

@@ -52,9 +52,11 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     groups = []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
+        """Return the task as evaluations use it, without platforms and blocks."""
         return task.evaluation.prepare_task(task).on_level_ground()
 
     def with_latencies(task: TaskCfg) -> TaskCfg:
+        """Return the task with nominal robots that differ only in the latency of their actions."""
         ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)
         ranges = replace(ranges, latency=task.randomization.latency)
         return replace(on_level_ground(task), randomization=ranges, events=())

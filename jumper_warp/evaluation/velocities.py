@@ -49,6 +49,7 @@ class VelocityLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
+        """Allocate results of one walk per world, before the first policy step."""
         self.count = len(self.commands)
         self.end = np.full(self.count, -1)
         self.fall_step = np.zeros(self.count, dtype=int)
@@ -261,6 +262,7 @@ class VelocityFlags:
     command_interval: float = 3.0  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
+        """Raise InputError for a grid of commands, an interval or a duration out of range."""
         interval = self.command_interval
         check(0.1 <= interval <= 600.0, f"command_interval must be in [0.1, 600] s, got {interval}")
         check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
@@ -294,6 +296,7 @@ class VelocityPlayFlags:
     command_interval: float = 2.5  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
+        """Raise InputError for a commanded velocity or length out of range."""
         check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))
 
     @property

@@ -130,6 +130,7 @@ def motor_arrays(
     """
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
+        """Return a constant of the two kinds of motors for every motor and world, (12, num_worlds)."""
         column = np.tile([lateral, transversal, transversal], 4)[:, None]
         values = np.repeat(column, num_worlds, axis=1)
         return wp.array(values, dtype=module.real, device=device, requires_grad=requires_grad)

@@ -99,6 +99,7 @@ def _may_end_without_result(func: Any) -> bool:
     """Return whether a Warp function returns a value on some paths but not on all; on the others Warp returns zeros."""
 
     def returns(statements: list[ast.stmt]) -> bool:
+        """Return whether every path through the statements reaches a `return`."""
         return any(
             isinstance(each, ast.Return) or (isinstance(each, ast.If) and returns(each.body) and returns(each.orelse))
             for each in statements

@@ -126,6 +126,7 @@ class RandomizationCfg:
         terms = []
 
         def add(func: Function, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
+            """Add an event that samples within a range, unless it is None; scale: from the range's unit to SI."""
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
                 terms.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **numbers))

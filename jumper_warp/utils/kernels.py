@@ -70,6 +70,7 @@ def loading_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) ->
     remaining = iter(list(variants))
 
     def load() -> None:
+        """Load modules until none remains; all workers take them from one iterator."""
         for module, block in remaining:
             wp.force_load(device, [module], block, 0)
 

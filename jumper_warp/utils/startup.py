@@ -49,6 +49,7 @@ class DeferredLoader(Loader):
     """Loader that turns a module into a `DeferredModule` instead of executing it by its own loader."""
 
     def __init__(self, loader: Loader) -> None:
+        """Store the module's own loader, which runs at the first use of the module."""
         self.loader = loader
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:

@@ -71,6 +71,7 @@ def locked(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Any:
+        """Call the function while holding the lock."""
         with WARP_LOCK:
             return function(*args, **kwargs)
 

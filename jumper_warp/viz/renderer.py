@@ -115,9 +115,11 @@ class Renderer(ABC):
         """Free the renderer's resources; it cannot draw afterwards."""
 
     def __enter__(self) -> Renderer:
+        """Return the renderer itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the renderer."""
         self.close()
 
 
