@@ -1,6 +1,7 @@
 """Reverse pass of a differentiable rollout with one thread per leg.
 
-Four launches for every `SPAN` saved rows of the trajectory.
+Four launches for every `SPAN` saved rows of the trajectory, from the last rows to the first: recompute the steps,
+reverse them, and add the gradients w.r.t. constants of legs and of motors. Few rows at a time bound the memory.
 """
 
 from __future__ import annotations

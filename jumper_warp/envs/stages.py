@@ -1,4 +1,9 @@
-"""Kernel launches of an environment's policy step and resets, in order, with their arrays."""
+"""Kernel launches of an environment's policy step and resets, in order, with their arrays.
+
+`part` is the range of worlds of a launch: all on a GPU, a slice per thread on a CPU. `mask` (num_envs,) is not 0 where
+a launch acts, so that the host makes no decision and a step can be a captured graph. A skill is a task in an
+environment of several.
+"""
 
 from __future__ import annotations
 

@@ -246,7 +246,7 @@ def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
 def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the smallest motor motion, (12,) [rad/m], that moves a paw from the plane of the others (`unevenness`).
 
-    angle: (12,) [rad]."""
+    It is the gradient over its squared norm, along which the correction `levelled` is least. angle: (12,) [rad]."""
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
     return slope / (slope @ slope)

@@ -1,4 +1,9 @@
-"""Settings of the motors and of the motor command filter, and the kernel structures made of them."""
+"""Settings of the motors and of the motor command filter, and the kernel structures made of them.
+
+The command filter keeps joints off their stops and links apart: it changes a target only if its joint would soon
+violate a limit. Angles are lateral (positive outward) and transversal, i.e. outer and inner (positive away from the
+leg's other thigh); their sum is the angle between the thighs. Torques and speeds are at the joint, behind the gear.
+"""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def top_level(definition: Any) -> tuple[ModuleType | None, str, str]:
 
 
 def _is_named(value: object) -> bool:
-    """Return whether a value is a Warp function or struct."""
+    """Return whether a value is a Warp function or struct, which copies share and pickles refer to by name."""
     return isinstance(value, wp.Function | Struct)
 
 

@@ -1,4 +1,8 @@
-"""Checks of a task's Warp functions and structs, before a kernel is compiled."""
+"""Checks of a task's Warp functions and structs, before a kernel is compiled.
+
+Warp's own errors name generated code; these name the user's file and line. "Own" means a user's, from outside the
+project, whose functions need no check.
+"""
 
 from __future__ import annotations
 

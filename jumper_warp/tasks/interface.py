@@ -1,4 +1,8 @@
-"""Description of the inputs and outputs of a task's policies, as plain data that is saved with every policy."""
+"""Description of the inputs and outputs of a task's policies, as plain data that is saved with every policy.
+
+A program that runs a policy, as on the robot, needs no other part of this package to turn sensor readings into an
+observation and an action into motor targets.
+"""
 
 from __future__ import annotations
 

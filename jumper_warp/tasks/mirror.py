@@ -1,4 +1,8 @@
-"""Left-right mirror maps of a task's observations and actions, as permutations and signs."""
+"""Left-right mirror maps of a task's observations and actions, as permutations and signs.
+
+A mirror-symmetric policy needs them: the robot is symmetric about its x-z plane. A term's mirror image is given by
+columns counted from 1, negative where the sign changes.
+"""
 
 from __future__ import annotations
 

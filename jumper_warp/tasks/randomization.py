@@ -1,4 +1,7 @@
-"""Domain randomisation (paper, Table V): ranges of physical parameters, and the events that sample them."""
+"""Domain randomisation (paper, Table V): ranges of physical parameters, and the events that sample them.
+
+A policy that is trained on many similar robots also works on the real one, whose parameters are not known exactly.
+"""
 
 from __future__ import annotations
 

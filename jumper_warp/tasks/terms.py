@@ -184,7 +184,7 @@ class RewardTerm(Term):
     returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: Function, weight: float, **values: Any) -> None:
-        """Store a reward function with its parameters by name, and its weight, negative for a penalty."""
+        """Store a reward function with its parameters by name, and its weight."""
         super().__init__(func, weight=weight, **values)
 
     @property
