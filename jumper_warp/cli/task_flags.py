@@ -122,7 +122,10 @@ def with_flags(value: Any, flags: Any) -> Any:
 
 
 def _parts(value: Any) -> Json:
-    """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
+    """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value.
+
+    Both directions, `flags_of` and `with_flags`, walk through a task by these names.
+    """
     if isinstance(value, Term):
         return {**value.numbers, **value.options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -133,7 +136,10 @@ def _parts(value: Any) -> Json:
 
 
 def _is_number(value: Any, hint: Any) -> bool:
-    """Return whether a setting can have a flag: it holds numbers or a choice, or is optional; no function or name."""
+    """Return whether a setting can have a flag: it holds numbers or a choice, or is optional; no function or name.
+
+    hint: annotation of the field, which distinguishes a choice (Literal) from a name, and what may replace None.
+    """
     if isinstance(value, str):
         return hint is not str
     if isinstance(value, tuple):

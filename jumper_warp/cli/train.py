@@ -162,6 +162,7 @@ def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
 def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
     """Return the settings parsed from `args`, with the recipe's as defaults, and the task changed by its --env flags.
 
+    tyro needs one dataclass of all flags: `TrainArgs`, here extended by a field with those of the task.
     Exits with 0 after help. Raises InputError: a setting is out of range.
     """
     from jumper_warp.cli.task_flags import flags_of, with_flags
@@ -190,7 +191,10 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
 
 
 def flagged_ranges(args: Sequence[str]) -> set[str]:
-    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments."""
+    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments.
+
+    Such a flag overrides the range in a robot overlay, even if its value is the default.
+    """
     from jumper_warp.robot.overlay import RANDOMIZED
 
     options = {option_of(arg) for arg in args}

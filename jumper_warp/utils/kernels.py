@@ -53,7 +53,10 @@ def content_hash(*parts: Any) -> bytes:
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
-    """Compile the modules of kernels in parallel, or load them from Warp's cache, and wait; see `loading_kernels`."""
+    """Compile the modules of kernels in parallel, or load them from Warp's cache, and wait; see `loading_kernels`.
+
+    Warp itself compiles a module at its first launch, one after the other.
+    """
     with loading_kernels(kernels, device):
         pass
 

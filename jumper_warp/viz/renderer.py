@@ -261,7 +261,10 @@ def _gl_viewer(size: tuple[int, int]) -> Any:
 
 
 def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float]) -> Model:
-    """Build a Newton model of all robots to draw, one copy of the robot's links for each entry of `opacity`."""
+    """Build a Newton model of all robots to draw, one copy of the robot's links for each entry of `opacity`.
+
+    It is only drawn: links are kinematic, without mass and collisions. Both of Newton's renderers draw a model.
+    """
     builder = newton.ModelBuilder()
     builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
     meshes = [
@@ -281,7 +284,10 @@ def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence
 
 
 def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-    """Convert polylines to line segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
+    """Convert polylines to line segments: return starts, ends [m], world frame, and colors; an arrow is one segment.
+
+    All are arrays of vec3, as Newton's viewer draws them; None hides the lines of the last image.
+    """
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]
