@@ -94,7 +94,8 @@ class FlightLog(EvaluationLog):
     def open_loop(self, late: np.ndarray) -> np.ndarray:
         """Return the transversal motor angles [deg] of the open-loop takeoff at the next policy step.
 
-        The result is (num_envs, 4), legs FL, FR, BL, BR.
+        A leg that extends a fraction of a policy step late gets the same fraction less of its extension in that step.
+        The default pose has 45 degrees. The result is (num_envs, 4), legs FL, FR, BL, BR.
         late: the field `late`.
         """
         step = len(self.tilts)
@@ -152,7 +153,8 @@ class FlightLog(EvaluationLog):
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Record a policy step from the arrays of `read_env`; return whether all flights have ended.
 
-        A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension.
+        A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension. A
+        takeoff is a step in which the robot rises without contact: paws of a robot that falls over lose contact too.
         """
         step = len(self.tilts)
         running = self.end < 0
@@ -299,7 +301,7 @@ class FlightRun(Run):
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return a function that returns the actions of jump and turning skill, (2, num_envs, 12).
 
-        Its argument is ignored.
+        Its argument is ignored: each policy gets the observations of its own skill.
         """
         scale = env.skills[JUMP].task.action_scale[1]
 

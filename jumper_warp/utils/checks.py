@@ -186,8 +186,8 @@ def check_seed(value: Any) -> int:
 def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:
     """Raise InputError unless limits of an angle [deg] are finite and in order, and zones inside do not overlap.
 
-    lower_zone, upper_zone: widths of hard zones inside the limits [deg], >= 0, in which a command filter clamps commands
-    toward the limit at any speed.
+    lower_zone, upper_zone: widths of hard zones inside the limits [deg], >= 0, in which a command filter clamps
+    commands toward the limit at any speed.
     """
     if not -FILTER_ANGLE <= lower < upper <= FILTER_ANGLE:
         raise InputError(
