@@ -180,7 +180,10 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Simulate the jumps with the current weights; return cost [1], with the trust region's penalty, and errors."""
+        """Simulate the jumps with the current weights; return cost [1], with the trust region's penalty, and errors.
+
+        The cost is half the sum of squared errors, weighted by importance, plus the penalty.
+        """
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)

@@ -142,7 +142,10 @@ class Anchor:
             self.actions = network.act(obs)
 
     def residuals(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12)."""
+        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12).
+
+        m: number of recorded observations, so that the sum of squares does not grow with their number.
+        """
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:

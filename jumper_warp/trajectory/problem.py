@@ -88,7 +88,10 @@ class SimulatedMotion:
     """
 
     def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
-        """Wrap a trajectory; quantities follow at first use. body: kinematics of the robot of `rollout`."""
+        """Wrap a trajectory; body: kinematics of the robot of `rollout`.
+
+        Quantities are computed at first use and kept, since objective and constraints share them.
+        """
         self.trajectory = trajectory
         self.body = body
         self.gravity = gravity
