@@ -67,7 +67,10 @@ def _flag(value: Any, hint: Any, where: str) -> Setting | None:
 
 
 def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
-    """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
+    """Return the flags of a dataclass's fields; fields that hold functions or names have none.
+
+    Its docstring and those of its fields become the help. where: path of the dataclass, for messages.
+    """
     hints = get_type_hints(type(value))
     docs = field_docs(type(value))
     flags = {}

@@ -144,7 +144,10 @@ def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Senso
 
 
 def without(normal: NormalEquations, sensor: Sensor) -> np.ndarray:
-    """Return the change of the fitted parameters (P,) if a sensor were left out of the fit, to first order."""
+    """Return the change of the fitted parameters (P,) if a sensor were left out of the fit, to first order.
+
+    It is a Gauss-Newton step: at the fit all gradients add up to 0, so that those of the others are minus the score.
+    """
     return np.linalg.solve(normal.information() + np.eye(len(sensor.score)) - sensor.information, sensor.score)
 
 

@@ -176,7 +176,9 @@ class Stance(NamedTuple):
 def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the paws' centres [m], base frame, (N, 4 legs FL, FR, BL, BR, 3), at motor angles (N, 12) [rad].
 
-    Where the knees are too far apart for the five-bar to close, the paw is midway between them.
+    In the leg's plane the paw is one shank away from both knees, on their lower side: at half the knees' distance, and
+    by `rise` times their difference, turned by 90 degrees, below its middle. The lateral motor then turns the plane
+    about body x. Where the knees are too far apart for the five-bar to close, the paw is midway between them.
     """
     paws = np.zeros((len(angle), 4, 3))
     for k, name in enumerate(LEGS):

@@ -124,7 +124,11 @@ def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: i
 
 
 def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: RobotValues) -> None:
-    """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each."""
+    """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each.
+
+    Gains and torque limits of `robots` are factors on those of `motors`; speeds and offsets are values. Peak torques
+    are the same for all robots.
+    """
     kinds = [motors.lateral, motors.transversal, motors.transversal] * 4
     ratios = {"kp": robots.kp, "kd": robots.kd, "saturation": robots.saturation, "peak": np.ones_like(robots.kp)}
     for name, ratio in ratios.items():

@@ -120,7 +120,10 @@ class Touch:
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the constants of a sliding block's motion in a step dt [s], body axes; zero in a world without one."""
+    """Return the constants of a sliding block's motion in a step dt [s], body axes; zero in a world without one.
+
+    The contact laws of the paws, which may push it, are in body axes too. `weight` is m g dt, an impulse.
+    """
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]

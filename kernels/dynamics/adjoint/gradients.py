@@ -67,6 +67,7 @@ class ThreadSums:
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
     """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1.
 
+    The caller sets the weight 0 where a thread repeats a step of another one only to take part in the warp's sums.
     writes, over_steps, over_legs: see `ThreadSums`.
     """
     sums = ThreadSums()

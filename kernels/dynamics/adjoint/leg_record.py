@@ -57,7 +57,10 @@ class BaseWeights:
 
 @wp.struct
 class LegWeights:
-    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step."""
+    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step.
+
+    The pass backwards in time solves them; the kernels of `constants_adjoint` read them, all steps in parallel.
+    """
 
     rates: vec3  # virtual rates of the motors
     law: vec3  # multiplier of the contact law, body axes
