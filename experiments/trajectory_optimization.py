@@ -164,7 +164,10 @@ class MotionReplay:
         self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], forces)
 
     def _evaluate(self) -> None:
-        """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""
+        """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown.
+
+        A lift begins and ends where the difference of "off the ground" between two physics steps is not 0.
+        """
         down = self.force > CONTACT_FORCE
         ticks = slice(self.sim.substeps - 1, None, self.sim.substeps)
         free = ~down[ticks].any(axis=1) & (self.up[ticks] > TAKEOFF_SPEED)

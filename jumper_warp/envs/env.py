@@ -381,7 +381,10 @@ class Env(Stages):
 
     @locked
     def snapshot(self) -> Snapshot:
-        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
+        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device.
+
+        Targets are saved in a ring by policy step; that of the last step acts until the next one arrives.
+        """
         sim = self.sim
         n = self.num_envs
         past = wp.to_torch(self.delays.target_history)

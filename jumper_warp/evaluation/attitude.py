@@ -98,7 +98,10 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def settling_time(self) -> np.ndarray:
-        """Time from which the error stays within `tolerance` to the end [s], (num_envs,); NaN if there is none."""
+        """Time from which the error stays within `tolerance` to the end [s], (num_envs,); NaN if there is none.
+
+        That is the end of the policy step after the last one whose error is larger.
+        """
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         outside = np.where((~inside).any(axis=0), len(inside) - (~inside)[::-1].argmax(axis=0), 0)
         return np.where(inside[-1], (outside + 1) * self.step_dt, np.nan)

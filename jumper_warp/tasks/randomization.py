@@ -112,7 +112,10 @@ class RandomizationCfg:
 
     @property
     def nominal_friction(self) -> float:
-        """Return the paws' friction coefficient [1] for evaluations without randomisation."""
+        """Return the paws' friction coefficient [1] for evaluations without randomisation.
+
+        Where training samples it, the middle of the default range, else the default of the simulation.
+        """
         return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
 
     def in_tests(self) -> RandomizationCfg:

@@ -258,7 +258,8 @@ def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
     """Return the base state shortly before touchdown: `flight` moved back by a sampled distance, with the paws ahead.
 
-    flight: base state on the ballistic flight; the paws (`spot`) stay below its position.
+    Paws ahead of the base let the legs brake the horizontal velocity. flight: base state on the ballistic flight; the
+    paws (`spot`) stay below its position.
     """
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)

@@ -204,7 +204,10 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`."""
+    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`.
+
+    The transposed equations, which the reverse pass solves, have the same matrices, and another right-hand side.
+    """
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)

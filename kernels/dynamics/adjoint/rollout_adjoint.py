@@ -199,7 +199,10 @@ def replay_row(
 
 @wp.func
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
-    """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t."""
+    """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t.
+
+    The wrench is constant in a policy step, whose physics steps each add their part. World axes, at the base's COM.
+    """
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
 
