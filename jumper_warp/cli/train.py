@@ -100,8 +100,8 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
 def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
     """Return the recipe and the checkpoint of the run that --resume selects in unparsed arguments.
 
-    Without the flag, and for a new run, the given recipe and None. Raises CheckpointError: the run is of another task,
-    or cannot be used.
+    The saved recipe gives the defaults of all other flags, so that they are parsed after it is found. Without the flag,
+    and for a new run, the given recipe and None. Raises CheckpointError: the run is of another task, or cannot be used.
     """
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}

@@ -156,8 +156,10 @@ class MotionResiduals:
     ) -> Linearised:
         """Compute the residuals of the motion and their Jacobian w.r.t. the unknowns by one-sided differences.
 
-        At parameters z (P,) and initial state start (I,). change: step by unknown, (P + I,) or one for all. The whole
-        Jacobian is NaN if any world diverges.
+        World 0 is at parameters z (P,) and initial state start (I,), each further one changes some unknowns, as
+        `_plan_jacobian` has assigned them: where unknowns of the four legs share a world, each counts for the residuals
+        of its leg alone. change: step by unknown, (P + I,) or one for all. The whole Jacobian is NaN if any world
+        diverges.
         """
         change = np.broadcast_to(change, len(z) + len(start))
         many_z, many_start = (np.repeat(x[None], len(self.jacobian_worlds) + 1, axis=0) for x in (z, start))

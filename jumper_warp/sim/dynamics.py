@@ -281,7 +281,8 @@ class JumperDynamics:
     def _workspace(self) -> KernelStruct:
         """Allocate the arrays that the solver's kernels write, such as impulses, forces and torques, all zero.
 
-        The reference pose is the model's `joint_q`. Returned as the kernels' `Workspace`.
+        They persist between launches: a step begins with the last one's impulses. A diverged world is put into the
+        reference pose, the model's `joint_q`. Returned as the kernels' `Workspace`.
         """
         scalar = self.modules.scalar
         n = self.num_worlds

@@ -26,6 +26,7 @@ class Mirror(NamedTuple):
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
     """Return the left-right mirror map of a task's observation; group: "actor" or "critic".
 
+    Each frame of a term's history is mirrored on its own: columns of the term become columns of the observation.
     Raises InputError: the mirror image of a term is not known.
     """
     columns: list[int] = []

@@ -88,7 +88,11 @@ class _Descent:
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian of candidates, the function to minimise, (starts * repeat,)."""
+        """Return the augmented Lagrangian of candidates, the function to minimise, (starts * repeat,).
+
+        A multiplier shifts the point from which a constraint's violation is penalised, so that the minimum satisfies
+        the constraints with a finite penalty. repeat: number of candidates by start.
+        """
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
@@ -97,7 +101,11 @@ class _Descent:
         return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
 
     def iterate(self, number: int) -> None:
-        """Take one L-BFGS step of every start; every `OUTER`-th iteration (`number`) also updates the multipliers."""
+        """Take one L-BFGS step of every start; every `OUTER`-th iteration (`number`) also updates the multipliers.
+
+        Each start moves to the best of the tried points if that is better. Its step grows if the longest one was the
+        best, and shrinks if a short one or none was.
+        """
         values, gradient = self.problem.gradient(self.x, self.merit)
         self._keep_best(self.x, values, 1)
         if number and number % OUTER == 0:
@@ -133,7 +141,10 @@ class _Descent:
         self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
     def _add_pair(self, gradient: torch.Tensor) -> None:
-        """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature."""
+        """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature.
+
+        Starts with curvature below 0 in this step get the factor 0, which leaves the pair out.
+        """
         if self.previous is None:
             return
         moved = self.x - self.previous[0]
@@ -143,7 +154,11 @@ class _Descent:
         self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(convex, 1.0 / product, 0.0))]
 
     def _direction(self, gradient: torch.Tensor) -> torch.Tensor:
-        """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
+        """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box.
+
+        The loops multiply the gradient by an approximate inverse Hessian, made of past steps and the gradient's changes
+        (`pairs`); a start without such a pair, or whose direction would ascend, follows the gradient.
+        """
         out = ((self.x <= -1.0) & (gradient > 0.0)) | ((self.x >= 1.0) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
         # names as in the book's algorithm 7.4

@@ -209,7 +209,10 @@ def reaches(height: float) -> Term:
 
 
 def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
-    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4 paws FL, FR, BL, BR, num)."""
+    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4 paws FL, FR, BL, BR, num).
+
+    It stays true after a paw's first contact, even if the paw lifts again.
+    """
     row, _ = motion.takeoff(speed)
     later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
     down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])

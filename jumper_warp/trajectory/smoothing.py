@@ -134,7 +134,10 @@ def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch
 
 
 class _BestPoints:
-    """Best point x (n, len(knots)) and lowest merit (n,) that the descent from each start has found so far."""
+    """Best point x (n, len(knots)) and lowest merit (n,) that the descent from each start has found so far.
+
+    A descent along smoothed gradients can become worse, and then continues from this point.
+    """
 
     def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):
         """Evaluate the starts x (n, len(knots)), the first best points; stage: whose merit ranks points."""

@@ -162,6 +162,7 @@ class GLRenderer(Renderer):
         self._viewer.set_model(self.model)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        """Return an image of the poses in `state`, drawn by Newton's viewer in its invisible window."""
         viewer = self._viewer
         camera = self._viewer.camera
         viewer.renderer._make_current()  # another window may have drawn since
@@ -215,6 +216,7 @@ class RayTracer(Renderer):
         self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        """Return an image of the poses in `state`, without lines; Newton's cameras look along their -z axis."""
         from newton.sensors import SensorCamera
         from scipy.spatial.transform import Rotation
 

@@ -18,6 +18,7 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 class VelocityState:
     """State of velocity tracking in a world: command, gait, tracking errors, curriculum levels and statistics.
 
+    Errors count only in settled policy steps: right after a command the robot still has to accelerate.
     Fields from `sum_xy` on accumulate until the host reads them.
     """
 

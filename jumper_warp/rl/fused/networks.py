@@ -29,7 +29,10 @@ _noted: list[tuple[Any, tuple, dict[str, Any]]] | None = None  # Kernels to comp
 
 
 class Layer(NamedTuple):
-    """Location of a layer's weight and bias in the kernels' padded parameter vector, and the layer's padded widths."""
+    """Location of a layer's weight and bias in the kernels' padded parameter vector, and the layer's padded widths.
+
+    The kernels multiply tiles of fixed width, so that they need padded copies of the parameters (`FlatParameters`).
+    """
 
     weight: int  # first entry of the weight (outputs, inputs)
     bias: int  # first entry of the bias (outputs,)

@@ -232,7 +232,8 @@ def leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power in a recorded step is differentiated.
 
-    step: its number in the rollout; dt [s]; i: its entry in the record.
+    Its acceleration follows from the rates of this entry and the next. step: its number in the rollout; dt [s]; i: its
+    entry in the record.
     """
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
