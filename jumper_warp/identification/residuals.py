@@ -89,8 +89,9 @@ class MotionResiduals:
     def _make_grid(self, dt: float | None) -> float:
         """Align the rows of a recording with physics steps of at most dt [s]; return the time [s] of the first step.
 
-        Sets stride, dt, rows and the row's position on the grid. Stamps that are uniform but for `JITTER` count as
-        uniform. Raises InputError: a gap above `LONGEST_GAP`.
+        With uniform time stamps a fitted line gives the period, and each row falls on a step: the step divides the
+        period. Else rows lie between steps. Sets stride, dt, rows and the row's position on the grid. Stamps that are
+        uniform but for `JITTER` count as uniform. Raises InputError: a gap above `LONGEST_GAP`.
         """
         motion = self.motion
         index = np.arange(len(self.motion.time), dtype=float)
