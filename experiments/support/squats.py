@@ -72,7 +72,8 @@ class SquatLog(EvaluationLog):
     def force_range(self) -> np.ndarray:
         """Largest minus smallest force on a paw within the window [N], maximum over the paws.
 
-        One value for each robot that has not ended.
+        The largest is over all physics steps, the smallest over the ends of policy steps, as the simulation only keeps
+        peaks in between. One value for each robot that has not ended.
         """
         return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
 

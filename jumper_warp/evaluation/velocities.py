@@ -65,7 +65,10 @@ class VelocityLog(EvaluationLog):
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
     def begin(self, env: Env) -> None:
-        """Reset every robot to the default pose, with its first command and the task's gait frequency."""
+        """Reset every robot to the default pose, with its first command and the task's gait frequency.
+
+        The frequency is the fourth value of a command, 0 for tasks without a gait clock.
+        """
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         self._command = self._slewed(self._command, self.commands[:, 0])
@@ -183,7 +186,7 @@ class VelocityLog(EvaluationLog):
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
     def all_commands(self) -> np.ndarray:
-        """Return all commanded velocities, (robots, commands, 3)."""
+        """Return all commanded velocities ahead, to the left [m/s] and about z [rad/s], (robots, commands, 3)."""
         return self.commands
 
     def marks(self) -> dict[str, np.ndarray]:

@@ -70,7 +70,12 @@ def minimise(
 
 
 class _Descent:
-    """State of an optimisation by the augmented Lagrangian method, for all starts in parallel."""
+    """State of an optimisation by the augmented Lagrangian method, for all starts in parallel.
+
+    Shapes: points `x` (starts, n), `step` [1], `penalty` and the last largest `violation` (starts,), multipliers
+    (starts, constraints); `pairs` are L-BFGS's past steps, changes of the gradient and inverse products, the oldest
+    first; `previous`: point and gradient before the last step.
+    """
 
     def __init__(self, problem: Problem, begin: np.ndarray, step: float, seed: int):
         """Place all starts at `begin` (starts, n), without curvature, multipliers or best points; see `minimise`."""
