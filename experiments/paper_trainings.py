@@ -97,9 +97,9 @@ def train_arm(arguments: Sequence[str]) -> tuple[Path, int]:
 
     Returns the run's folder, and the number of policy steps of all worlds in an iteration.
     """
-    recipe, checkpoint = parse_train([*arguments, "--resume", "latest-or-new"])
+    recipe, checkpoints = parse_train([*arguments, "--resume", "latest-or-new"])
     command = shlex.join(["jumper", "train", *arguments])
-    result = train(recipe, checkpoint=checkpoint, command=command)
+    result = train(recipe, checkpoints=checkpoints, command=command)
     return result.folder, recipe.train.num_envs * recipe.train.ppo.num_steps
 
 

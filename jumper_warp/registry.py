@@ -233,6 +233,8 @@ def find_task(name: str) -> tuple[str, TaskEntry]:
 
     Raises InputError: the task is unknown, or in several packages.
     """
+    if not isinstance(name, str):
+        raise InputError(f"a task's name must be a text, got {name!r:.60}")
     known = task_name(name)
     if known is None:
         raise InputError(_unknown_task(name))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from jumper_warp.policies.policy import actor_init_from_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
+from jumper_warp.rl import seeds as several
 from jumper_warp.rl.run_folder import TrainResult
 from jumper_warp.tasks.mirror import mirror_of
 
@@ -15,21 +18,28 @@ if TYPE_CHECKING:
 
 
 def train(
-    recipe: Recipe, *, checkpoint: Checkpoint | None = None, command: str | None = None, expected_rate: float = 0.0
-) -> TrainResult:
-    """Train a policy, save checkpoints in a new run's folder, and return the result.
+    recipe: Recipe, *, seeds: Sequence[int] | None = None, checkpoints: Sequence[Checkpoint] = (),
+    command: str | None = None, expected_rate: float = 0.0,
+) -> TrainResult:  # fmt: skip
+    """Train a policy, or one of each seed, save checkpoints in a new run's folder, and return the result.
 
-    checkpoint: to continue from (default: the one that `recipe.train.resume` selects). command, expected_rate: as in
-    `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, or has no
-    mirror image and a symmetric policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
+    seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
+    (default: those that `recipe.train.resume` selects). command, expected_rate: as in `jumper_warp.rl.runner.train`,
+    which lists the errors. Also raises InputError: the task cannot be saved, or has no mirror image and a symmetric
+    policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
     """
     recipe.check_saving()
     cfg, task = recipe.train, recipe.task
+    if seeds is not None:
+        cfg = dataclasses.replace(cfg, seeds=tuple(seeds))
     if cfg.ppo.symmetry != "off":
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
     actor_init = as_rsl_rl = None
-    if cfg.init_policy and checkpoint is None:
+    if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
     if cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
+    if cfg.seeds:
+        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints)
+    checkpoint = checkpoints[0] if checkpoints else None
     return runner.train(cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate)

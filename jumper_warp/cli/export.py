@@ -49,7 +49,7 @@ def export(cfg: ExportCfg) -> Path:
     """
     from jumper_warp.policies.catalog import is_run, newest_run, run_folder
     from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
-    from jumper_warp.rl.resume import CHECKPOINTS
+    from jumper_warp.rl.run_names import CHECKPOINTS
 
     source = Path(newest_run(cfg.source))
     if cfg.out is not None and cfg.out.suffix != ".onnx":

@@ -64,8 +64,8 @@ class TrainArgs:
     minutes."""
 
 
-def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
-    """Return the recipe that the arguments of `jumper train` make, and the checkpoint that is resumed.
+def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
+    """Return the recipe that the arguments of `jumper train` make, and the checkpoints that are resumed.
 
     Exits with 0 after help. args: the task, then flags. With --resume the saved recipe of the run has the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
@@ -84,7 +84,7 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    recipe, checkpoint = resumed(Recipe.of(name), args)
+    recipe, checkpoints = resumed(Recipe.of(name), args)
     parsed, task = parse_settings(recipe, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
@@ -94,32 +94,37 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
     if robot is not None:
         task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
     given = {name: getattr(parsed, name) for name in ("solver", "randomize", "noise")}
-    return Recipe(with_history(task, parsed.history), parsed.cfg, robot=robot, **given), checkpoint
+    return Recipe(with_history(task, parsed.history), parsed.cfg, robot=robot, **given), checkpoints
 
 
-def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, Checkpoint | None]:
-    """Return the recipe and the checkpoint of the run that --resume selects in unparsed arguments.
+def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
+    """Return the recipe and the checkpoints, one of each seed, of the run that --resume selects in unparsed arguments.
 
     The saved recipe gives the defaults of all other flags, so that they are parsed after it is found. Without the flag,
-    and for a new run, the given recipe and None. Raises CheckpointError: the run is of another task, or cannot be used.
+    and for a new run, the given recipe and no checkpoint. Raises CheckpointError: the run is of another task, or cannot
+    be used.
     """
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}
     if "resume" not in session:
-        return recipe, None
+        return recipe, []
     from jumper_warp.rl.checkpoint import CheckpointError
-    from jumper_warp.rl.resume import find_checkpoint
+    from jumper_warp.rl.resume import find_checkpoints
+    from jumper_warp.rl.run_names import seed_folders
 
-    checkpoint = find_checkpoint(dataclasses.replace(recipe.train, **session))
-    if checkpoint is None:
-        return recipe, None
+    checkpoints = find_checkpoints(dataclasses.replace(recipe.train, **session))
+    if not checkpoints:
+        return recipe, []
+    checkpoint = checkpoints[0]
     try:
         saved = recipe.from_json(parse_json(checkpoint.state["config"], "config"), defaults=recipe.train)
     except ValueError as error:
         raise CheckpointError(f"{checkpoint.path}: {error}") from error
     if saved.train.task != recipe.train.task:
         raise CheckpointError(f"{checkpoint.path}: of a run of {saved.train.task:.60}, not of {recipe.train.task}")
-    return saved, checkpoint
+    seeds = tuple(seed_folders(checkpoint.path.parents[2])) if len(checkpoint.path.parents) > 2 else ()
+    train = dataclasses.replace(saved.train, seeds=seeds)
+    return dataclasses.replace(saved, train=train), checkpoints
 
 
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
@@ -226,7 +231,7 @@ def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[st
     """
     from jumper_warp.rl.logger import format_duration
 
-    steps = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs
+    steps = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs * max(1, len(cfg.seeds))
     threads = checked_threads(cfg.threads)
     rate = PRESET_STEPS_PER_SECOND * min(threads, 2) / 2 if preset else CPU_STEPS_PER_SECOND * threads
     seconds = steps / rate
@@ -248,7 +253,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     modules: the user's, whose tasks are registered already.
     Raises as `parse_train` and `jumper_warp.training.train`.
     """
-    recipe, checkpoint = parse_train(args)
+    recipe, checkpoints = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
     from jumper_warp.training import train
     from jumper_warp.utils.runtime import configure_device
@@ -259,14 +264,14 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     rate = 0.0
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
-        presets = () if preset or checkpoint else find_task(task.name)[1].presets
-        report_cpu_time(cfg, checkpoint.state["iteration"] if checkpoint else 0, preset, presets)
+        presets = () if preset or checkpoints else find_task(task.name)[1].presets
+        report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, preset, presets)
         if preset and recipe.solver == "jumper":
             rate = PRESET_STEPS_PER_SECOND
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     try:
-        result = train(recipe, checkpoint=checkpoint, command=command_line(args, modules), expected_rate=rate)
+        result = train(recipe, checkpoints=checkpoints, command=command_line(args, modules), expected_rate=rate)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
             worlds = f"num_envs {cfg.num_envs} does not fit"

@@ -112,19 +112,7 @@ class DeployedPolicy:
 
         Raises InputError: it is of another size, not finite, or implausible.
         """
-        try:
-            with np.errstate(over="ignore"):
-                value = np.atleast_1d(np.asarray(reading))
-                if value.dtype.kind not in "fiub":
-                    raise TypeError(f"values of type {value.dtype}")
-                value = value.astype(np.float32)
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{name} must be numbers, got {reading!r:.60}") from None
-        width = _width(self.layout[name])
-        if value.shape != (width,):
-            raise InputError(f"{name} must have {width} values, got shape {value.shape}")
-        if not np.isfinite(value).all():
-            raise InputError(f"{name} is not finite: {value!s:.100}; hold the last target")
+        value = _numbers(name, reading, _width(self.layout[name]))
         bound, unit = PLAUSIBLE.get(name, (LARGEST, ""))
         largest = value[np.argmax(np.abs(value))]
         if abs(largest) > bound:
@@ -148,19 +136,25 @@ class DeployedPolicy:
         return self._frames[name].ravel()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Run the policy's network and return the action, (12,), in [-1, 1]; observation: (num_obs,) float32."""
-        self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
+        """Run the policy's network and return the action, (12,), in [-1, 1].
+
+        observation: (num_obs,). Raises InputError: it has another size, or is not finite.
+        """
+        obs = _numbers("observation", observation, len(self.interface["observation_names"]))
+        self.action = np.asarray(self._session.run(["actions"], {"obs": obs[None]})[0])[0]
         return self.action
 
     def filter_targets(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
         """Return motor targets [rad], (12,), from which `limit_command` removes part of the excess over joint limits.
 
         It is applied to each angle, then to each leg's sum of outer and inner angle, as in
-        `kernels/actuation/command_filter.py`. target, angle: (12,) [rad]; rate: [rad/s].
+        `kernels/actuation/command_filter.py`. target, angle: (12,) [rad]; rate: [rad/s]. Raises InputError: one has
+        another size, or is not finite.
         """
         settings = self.interface["command_filter"]
-        target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND).reshape(4, 3)
-        angle, rate = (np.asarray(values, dtype=np.float32).reshape(4, 3) for values in (angle, rate))
+        joints = (("target", target), ("angle", angle), ("rate", rate))
+        target, angle, rate = (_numbers(name, values, len(JOINTS)).reshape(4, 3) for name, values in joints)
+        target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND)
         filtered = np.empty_like(target)
         for motor, kind in enumerate(("lateral", "transversal", "transversal")):
             joint = (target[:, motor], angle[:, motor], rate[:, motor])
@@ -212,6 +206,23 @@ def _interface(file: str | Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if missing := [name for name in ("angle", "rate") if name not in layout]:
         raise InputError(f"{file}: the observation lacks {' and '.join(missing)}, which the command filter needs")
     return interface
+
+
+def _numbers(name: str, values: Any, width: int) -> np.ndarray:
+    """Return a number or an array as (width,) float32. Raises InputError: it is of another size, or not finite."""
+    try:
+        with np.errstate(over="ignore"):
+            array = np.atleast_1d(np.asarray(values))
+            if array.dtype.kind not in "fiub":
+                raise TypeError(f"values of type {array.dtype}")
+            array = array.astype(np.float32)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} must be numbers, got {values!r:.60}") from None
+    if array.shape != (width,):
+        raise InputError(f"{name} must have {width} values, got shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} is not finite: {array!s:.100}; hold the last target")
+    return array
 
 
 def _width(term: Mapping[str, Any]) -> int:
@@ -273,12 +284,11 @@ class JumpCommand:
         Call it once per policy step. vertical_velocity: of the base, world frame, upward positive [m/s]; paws_down:
         number of paws on the ground. Raises InputError, and changes nothing: one is not finite or implausible.
         """
-        if not (math.isfinite(vertical_velocity) and math.isfinite(paws_down)):
-            raise InputError(f"vertical_velocity and paws_down must be finite, got {vertical_velocity}, {paws_down}")
         fastest = PLAUSIBLE["lin_vel"][0]
-        if abs(vertical_velocity) > fastest or not 0 <= paws_down <= 4:
-            given = f"{vertical_velocity:.4g}, {paws_down}"
-            raise InputError(f"vertical_velocity must be within ±{fastest:g} m/s and paws_down 0 to 4, got {given}")
+        if not isinstance(vertical_velocity, Real) or not -fastest <= vertical_velocity <= fastest:
+            raise InputError(f"vertical_velocity must be within ±{fastest:g} m/s, got {vertical_velocity!r:.40}")
+        if paws_down not in range(5):
+            raise InputError(f"paws_down must be 0, 1, 2, 3 or 4, got {paws_down!r:.40}")
         rises = vertical_velocity > self._takeoff_speed
         if self.in_flight and paws_down > 0 and not rises:
             self.requested = False

@@ -132,7 +132,7 @@ class Rollout(Uncopied):
         self.dt = dt
         self.substeps = substeps
         self.every = every
-        self._actuation = self._make_actuation(motors or jumping_motors(), command_filter)
+        self._actuation = self._make_actuation(jumping_motors() if motors is None else motors, command_filter)
         self.motors = self._actuation.motors  # The kernels' `MotorArrays`, whose arrays are among the parameters
         self.parameters: dict[str, wp.array] = {
             "table": self.dynamics.robot.table,
@@ -203,6 +203,7 @@ class Rollout(Uncopied):
 
         lengths: (4, 10), see `geometry`. Raises InputError: another shape, or not finite.
         """
+        lengths = real_array(lengths, "geometry", np.float64)
         if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
             raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
         if not np.isfinite(lengths).all():
@@ -245,7 +246,7 @@ class Rollout(Uncopied):
         if not self.device.is_cuda:
             check_within("latency [s]", self.parameters["latency"].numpy(), LATENCY_RANGE)
         vec3 = self.dynamics.modules.scalar.vec3
-        count = len(targets)
+        count = len(targets) if hasattr(targets, "__len__") else 0
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))

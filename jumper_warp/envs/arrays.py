@@ -127,7 +127,7 @@ def to_numpy(values: object) -> object:
 
 def checked_values(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Return a scalar or array as float32 array of `shape`. Raises InputError: other shape, or not finite."""
-    array = real_array(to_numpy(values), name)
+    array = real_array(values, name)
     if array.ndim and array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
@@ -183,7 +183,7 @@ def checked_commands(commands: object, mask: np.ndarray, tasks: Sequence[TaskCfg
     mask: (num_envs,), nonzero for worlds to command.
     commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
-    array = real_array(to_numpy(commands), "commands")
+    array = real_array(commands, "commands")
     n = len(mask)
     errors = []
     for task in tasks:

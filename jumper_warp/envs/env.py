@@ -133,7 +133,7 @@ class Env(Stages):
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         init_warp()
-        self.wp_device = wp.get_device(device and str(device))
+        self.wp_device = wp.get_device(None if device is None else str(device))
         physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
         with loading_kernels([*physics, *usual_kernels(run, auto_reset)], self.wp_device):
             self.sim = Simulation(

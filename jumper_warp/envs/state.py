@@ -49,7 +49,8 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     """Restore a saved state of an environment, so that the following steps are bitwise the same.
 
-    States of earlier versions lack counters and conditions: counters become 0.
+    States of earlier versions lack counters and conditions: counters become 0. Values that are not finite are restored
+    too: without `auto_reset` a diverged world keeps them.
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
     noise, refine or version.
     """

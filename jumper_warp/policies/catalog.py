@@ -22,7 +22,7 @@ from typing import Any
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.run_names import newest
+from jumper_warp.rl.run_names import SEED, newest, seed_of, split_seed
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.errors import InputError, suggestion
@@ -74,7 +74,8 @@ def _own_policy(name: Path) -> Path | None:
 def is_run(source: str | Path) -> bool:
     """Return whether `source` is a checkpoint, or a training run's folder with checkpoints, also of rsl-rl."""
     path = Path(source)
-    return path.suffix == ".pt" or any(path.glob("checkpoints/*.pt")) or any(path.glob("model_[0-9]*.pt"))
+    patterns = ("checkpoints/*.pt", f"{SEED}*/checkpoints/*.pt", "model_[0-9]*.pt")
+    return path.suffix == ".pt" or any(any(path.glob(pattern)) for pattern in patterns)
 
 
 def run_folder(source: Path) -> Path:
@@ -85,11 +86,18 @@ def run_folder(source: Path) -> Path:
 
 
 def newest_run(source: str | Path) -> str | Path:
-    """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged."""
-    path = Path(source)
+    """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged.
+
+    Of a run of several seeds, return the folder of the seed N that `source` names, as RUN:N, or of the median seed; see
+    `seed_of`. Raises InputError: the run has no such seed.
+    """
+    path, seed = split_seed(source)
     if _own_policy(path) or not path.is_dir():
         return source
-    return newest(filter(is_run, path.glob("*/"))) or source
+    if not path.name.startswith(SEED) and not any(path.glob(f"{SEED}*/")):
+        path = newest(filter(is_run, path.glob("*/"))) or path
+    found = seed_of(path, seed)
+    return source if found == Path(source) else found
 
 
 def _no_policy(text: str, path: Path) -> str:
@@ -155,8 +163,11 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
 def write_files(folder: Path, files: Mapping[str, bytes], old: Mapping[str, bytes]) -> None:
     """Write files of a policy (name to content) and its manifest; old: the folder's files, which the manifest keeps.
 
-    Raises OSError: the disk is full or the folder cannot be written.
+    Raises PolicyError: a name is not that of a file in a folder. OSError: the disk is full or the folder cannot be
+    written.
     """
+    if wrong := [name for name in files if not FILE_NAME.fullmatch(name)]:
+        raise PolicyError(f"{folder}: a policy cannot hold a file {wrong[0]!r:.60}")
     present = {name: hashlib.sha256(data).hexdigest() for name, data in old.items()}
     written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": present}

@@ -45,7 +45,7 @@ from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_m
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
-from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.rl.run_names import CHECKPOINTS
 from jumper_warp.tasks import saving
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
@@ -185,8 +185,15 @@ class Policy(nn.Module):
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
-    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `Policy.load`."""
-    return Policy.load(name).to(device)
+    """Load a policy by name, folder or checkpoint to a device, and return it; name and errors: as `Policy.load`.
+
+    Raises InputError: there is no such device.
+    """
+    policy = Policy.load(name)
+    try:
+        return policy.to(torch.device(device))
+    except (RuntimeError, TypeError, AssertionError) as error:  # AssertionError: torch has no CUDA
+        raise InputError(f"no device {device!r:.60} ({one_line_message(error):.100})") from error
 
 
 def _named(layers: Weights, mean: torch.Tensor, std: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -10,6 +10,7 @@ from jumper_warp.utils.checks import (
     ACTIVATIONS,
     MAX_HIDDEN,
     MAX_WIDTH,
+    NAME,
     check_bounds,
     check_count,
     check_flag_fields,
@@ -135,6 +136,9 @@ class TrainCfg:
     iteration, without building and compilation, but with logging and saving."""
     seed: int = 1
     """Random seed of weights, noise and worlds. Range 0 to 2^31 - 1; each process derives a different seed from it."""
+    seeds: tuple[int, ...] = ()
+    """Seeds of several trainings with these settings, side by side on one device, each with `num_envs` worlds (default:
+    one training with `seed`). Under torchrun every GPU trains some of the seeds."""
     device: str | None = None
     """PyTorch device, such as cuda:0 or cpu (default: a GPU if there is one)."""
     threads: int | None = None
@@ -143,6 +147,10 @@ class TrainCfg:
     results."""
     log_root: Path = Path("logs")
     """Folder of all runs. A run is written to log_root/<task>/<start time>."""
+    run_name: str | None = None
+    """Name of the run, which follows the time in its folder's name, and is shown in titles and lists."""
+    tags: tuple[str, ...] = ()
+    """Words that describe the run, for `jumper list runs` and Weights & Biases."""
     log_interval: int = 10
     """Number of iterations between two logged iterations; those with a checkpoint are logged too."""
     save_interval: int = 100
@@ -167,8 +175,8 @@ class TrainCfg:
     Without it the value counts as 0, one line names it, and the state of its world is saved."""
     tensorboard: bool = True
     """Whether to write TensorBoard events."""
-    wandb: bool = False
-    """Whether to upload metrics to Weights & Biases."""
+    wandb: str | None = None
+    """Project of Weights & Biases to which metrics are uploaded (default: none); WANDB_MODE=offline keeps them here."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Hyperparameters of PPO; rsl-rl uses some of them."""
 
@@ -182,6 +190,12 @@ class TrainCfg:
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
         object.__setattr__(self, "seed", check_seed(self.seed))
+        object.__setattr__(self, "seeds", tuple(check_seed(seed) for seed in self.seeds))
+        if len(set(self.seeds)) < len(self.seeds):
+            raise InputError(f"seeds must be distinct, got {self.seeds}")
+        for name in (self.run_name, *self.tags):
+            if name is not None and not NAME.fullmatch(name):
+                raise InputError(f"run_name and tags may contain letters, digits, _ . - and spaces, got {name!r:.60}")
         if self.trainer not in ("ppo", "rsl-rl"):
             raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):
@@ -191,6 +205,8 @@ class TrainCfg:
                 raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
             raise InputError("pass resume, to continue a training, or init_policy, to begin one, not both")
+        if self.trainer == "rsl-rl" and self.seeds:
+            raise InputError("seeds are not supported with trainer rsl-rl; pass seed")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not supported with trainer {self.trainer}")
 
@@ -198,6 +214,10 @@ class TrainCfg:
         """Raise InputError unless trainer, number of worlds and batch size are valid for a number of processes."""
         if self.trainer != "ppo" and count > 1:
             raise InputError(f"trainer {self.trainer} supports one process only")
+        if self.seeds:
+            if len(self.seeds) < count:
+                raise InputError(f"{count} processes need as many seeds, got {len(self.seeds)}")
+            count = 1  # each process trains its seeds alone
         if self.num_envs % count:
             raise InputError(f"num_envs {self.num_envs} is not divisible by {count} processes")
         if self.trainer == "ppo":
@@ -205,7 +225,7 @@ class TrainCfg:
 
 
 RSL_RL_UNUSED = (
-    "log_interval", "max_checkpoints", "best_metric", "tensorboard", "wandb", "ppo.normalise_value",
+    "log_interval", "max_checkpoints", "best_metric", "seeds", "tensorboard", "wandb", "ppo.normalise_value",
     "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
     "ppo.graphs", "ppo.fused",
 )  # fmt: skip

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import torch
 
+from jumper_warp.rl.run_names import MANIFEST
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, existing_file, read_file, read_json, write_atomically
 
-MANIFEST = "manifest.json"  # File in the checkpoints' folder with SHA-256, iteration and score of each
 PURPOSE = "checkpoint of a training"
 MAX_BYTES = 8 * 2**30  # Size of the largest checkpoint that is read
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
@@ -124,14 +124,19 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
     raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *skipped]))
 
 
-def newest_name(folder: Path) -> str:
-    """Return the file name of a folder's last saved checkpoint, even if damaged.
+def checkpoint_names(folder: Path) -> list[str]:
+    """Return the file names of a folder's checkpoints, even if damaged, in the order of saving.
 
     Raises CheckpointError: there is none.
     """
     if not (manifest := _read_manifest(folder)):
         raise CheckpointError(f"{folder}: no checkpoint")
-    return list(manifest)[-1]
+    return list(manifest)
+
+
+def newest_name(folder: Path) -> str:
+    """Return the file name of a folder's last saved checkpoint, even if damaged. Raises as `checkpoint_names`."""
+    return checkpoint_names(folder)[-1]
 
 
 def best_checkpoint(folder: Path) -> Path:

@@ -16,9 +16,15 @@ class CapturedProcedure:
     If the capture fails on any rank, all ranks run the procedure eagerly, and print a warning.
     """
 
-    def __init__(self, procedure: Callable[[], object], enabled: bool) -> None:
-        """Wrap a procedure; it uses the same tensors in every call and does not synchronise with the host."""
+    def __init__(
+        self, procedure: Callable[[], object], enabled: bool, generator: torch.Generator | None = None
+    ) -> None:
+        """Wrap a procedure; it uses the same tensors in every call and does not synchronise with the host.
+
+        generator: a random generator of its own that the procedure draws from.
+        """
         self._procedure = procedure
+        self._generator = generator
         self.enabled = enabled
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warm = False
@@ -42,6 +48,8 @@ class CapturedProcedure:
         torch.cuda.synchronize()
         wait_for_ranks()  # no collective of an eager call may be in progress on any rank
         graph, reason = torch.cuda.CUDAGraph(), ""
+        if self._generator is not None:
+            graph.register_generator_state(self._generator)
         current = torch.cuda.current_stream()
         stream = None if current == torch.cuda.default_stream() else current
         try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -47,8 +48,11 @@ class Rollouts(Protocol):
     episode: torch.Tensor  # (2, num_envs) return and length of each world's current episode
     finished: torch.Tensor  # (3, num_envs) sums of returns and lengths, and number, of the finished episodes
 
-    def roll(self) -> None:
-        """Run the current policy for `PpoCfg.num_steps` policy steps, and record all transitions."""
+    def roll(self, generator: torch.Generator | None = None) -> None:
+        """Run the current policy for `PpoCfg.num_steps` policy steps, and record all transitions.
+
+        generator: of the exploration noise (default: torch's).
+        """
 
 
 class Learner(ABC):
@@ -77,6 +81,8 @@ class Learner(ABC):
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
         self._entropy_coef = torch.full((), cfg.entropy_coef, device=env.device)
+        self.generator = torch.Generator(env.device).manual_seed(torch.initial_seed())
+        """Random generator of actions and of the samples' order; it starts with torch's seed."""
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # sums of the statistics, and the number of steps
@@ -84,8 +90,8 @@ class Learner(ABC):
     def _capture(self, *, epochs: bool = True) -> None:
         """Prepare the parts of an iteration, as CUDA graphs where the settings ask for them; epochs: the update too."""
         graphs = self.env.device.type == "cuda" and self.cfg.graphs
-        self._roll = CapturedProcedure(self.collector.roll, graphs)
-        self._batch = CapturedProcedure(self.batch, graphs)
+        self._roll = CapturedProcedure(partial(self.collector.roll, self.generator), graphs, self.generator)
+        self._batch = CapturedProcedure(self.batch, graphs, self.generator)
         self._optimise = CapturedProcedure(self._run_epochs, graphs and epochs)
 
     @abstractmethod
@@ -132,7 +138,7 @@ class Learner(ABC):
 
     def order(self) -> torch.Tensor:
         """Return a random permutation of the batch's samples, (batch_size,) int64."""
-        return torch.rand(self.batch_size, device=self.env.device).argsort()
+        return torch.rand(self.batch_size, device=self.env.device, generator=self.generator).argsort()
 
     def set_progress(self, progress: float) -> None:
         """Set the desired KL divergence and the entropy coefficient for the training's progress (0: start, 1: end).
@@ -158,6 +164,11 @@ class Learner(ABC):
         self._sums.zero_()
         finished.zero_()
         return metrics
+
+    def is_finite(self) -> bool:
+        """Return whether all weights and observation statistics are finite (waits for the device)."""
+        parts = (self.flat.value, *(buffer for buffer in self.model.buffers() if buffer.is_floating_point()))
+        return bool(torch.stack([part.isfinite().all() for part in parts]).all())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the training's state as nested dicts of tensors: `model`, `optimiser`, `lr` and `episode`."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 import math
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -16,8 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
+from jumper_warp.rl.resume import flat_settings
+from jumper_warp.rl.run_names import SEED, title
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import mean
 from jumper_warp.utils.progress import format_duration
 
 
@@ -60,75 +64,48 @@ class Stopwatch:
         return [sum(part) / len(part) for part in zip(*seconds, strict=True)], (self._since - since) / len(laps)
 
 
-class TrainingLog:
-    """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
+class TrainingConsole:
+    """Context manager of the terminal's lines and progress bar of a training."""
 
-    def __init__(
-        self, folder: Path, config: dict[str, Any], total: int, steps: int, tensorboard: bool = True,
-        wandb: bool = False, iteration: int = 0, expected_rate: float = 0.0,
-    ) -> None:  # fmt: skip
-        """Open the metrics file and the other outputs of the log; folder: the run's existing folder.
+    def __init__(self, cfg: TrainCfg, iteration: int = 0, expected_rate: float = 0.0) -> None:
+        """Prepare the terminal; cfg: of the training. iteration: iterations so far.
 
-        config: JSON-ready configuration of the run. total: largest number of iterations. steps: environment steps per
-        iteration, of all worlds. tensorboard: whether to write events. wandb: whether to upload to Weights & Biases.
-        iteration: iterations so far; lines logged of later iterations are removed. expected_rate: as in
-        `jumper_warp.rl.runner.train`.
-        Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
+        expected_rate: as in `jumper_warp.rl.runner.train`.
         """
         self._console = _PipeSafeConsole(stderr=True)
-        self._file = MetricsFile(folder / METRICS_FILE, iteration)
-        self._events = _event_writer(folder, iteration) if tensorboard else None
-        self._disk_full = False
-        self._total, self._steps = total, steps
+        self._total, self._steps = cfg.max_iterations, cfg.ppo.num_steps * cfg.num_envs * max(1, len(cfg.seeds))
         self._first, self._expected_rate = iteration + 1, expected_rate
-        self._wandb = _wandb(folder, config) if wandb else None
         wrapped = TextColumn("{task.description}", table_column=Column(no_wrap=False))
         columns, hidden = (TimeElapsedColumn(), BarColumn(bar_width=12), wrapped), not self._console.is_terminal
         self._progress = Progress(*columns, console=self._console, disable=hidden)
         self._task = self._progress.add_task("training", total=None)
 
-    def __enter__(self) -> TrainingLog:
-        """Show the training's progress bar; report lines that were removed from the metrics file."""
+    def __enter__(self) -> TrainingConsole:
+        """Show the training's progress bar."""
         self._progress.start()
-        if self._file.dropped:
-            self.print_line(f"{self._file.path}: removed {self._file.dropped} incomplete or later lines")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close all outputs of the log: file, terminal, TensorBoard and Weights & Biases."""
-        for close in (self._progress.stop, self._file.close, *([self._events.close] if self._events else [])):
-            with suppress(OSError):  # such as that of a closed terminal
-                close()
-        if self._wandb:
-            self._wandb.finish()
+    def __exit__(self, *_: object) -> None:
+        """Remove the progress bar."""
+        with suppress(OSError):  # such as that of a closed terminal
+            self._progress.stop()
 
     def print_line(self, line: str) -> None:
         """Print a line above the progress bar; a failure to print it (OSError) is ignored."""
         with suppress(OSError):
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
-        """Log the metrics of an iteration by name, such as `Loss/value`; remaining: estimated time to the end [s]."""
-        try:
-            self._file.add(iteration, metrics)
-        except OSError as error:
-            if not self._disk_full:
-                path = self._file.path
-                self.print_line(f"{path}: {error.strerror}; training continues, the metrics are written later")
-            self._disk_full = True
-        self._write_events(iteration, metrics)
-        if self._wandb:
-            self._wandb.log(metrics, step=iteration)
-        elapsed = metrics["Perf/elapsed_s"]
+    def show(self, iteration: int, seeds: Sequence[dict[str, float]], remaining: float) -> None:
+        """Show the metrics of each seed in an iteration; remaining: estimated time to the end [s]."""
+        elapsed = max(metrics["Perf/elapsed_s"] for metrics in seeds)
+        rate = sum(metrics["Perf/total_fps"] for metrics in seeds)
         progress = f"iteration {iteration}/{self._total}, {iteration * self._steps / 1.0e6:.2f} M steps"
-        line = f"{progress}: {_summary(metrics)}, {format_duration(remaining)} left"
+        line = f"{progress}: {rate:,.0f} steps/s{_summary(seeds)}, {format_duration(remaining)} left"
         self._progress.update(self._task, completed=elapsed, total=elapsed + remaining, description=line)
         if not self._console.is_terminal:
             self.print_line(line)
         if iteration > self._first:
-            self.check_rate(metrics["Perf/total_fps"])
+            self.check_rate(rate)
 
     def print_speed(self, rate: float, remaining: float) -> None:
         """Print the measured step rate [1/s] and the estimated time to the end [s]; warn if the rate is low."""
@@ -143,6 +120,124 @@ class TrainingLog:
             advice = f"close other programs that use the cores{waiting if torch.get_num_threads() > 1 else ''}"
             self.print_line(f"slow: {usual}; {advice}")
             self._expected_rate = 0.0
+
+
+class SeedsConsole(TrainingConsole):
+    """Terminal of several seeds: one line for all of them, with means and intervals over the seeds."""
+
+    def __init__(self, cfg: TrainCfg, iteration: int = 0, *, quiet: bool = False) -> None:
+        """Prepare the terminal; cfg, iteration: see `TrainingConsole`. quiet: print nothing."""
+        super().__init__(cfg, iteration)
+        self._console.quiet = quiet
+        self._logged: dict[int, dict[str, float]] = {}
+        self._last = (0, 0.0)
+
+    def of_seed(self, seed: int) -> SeedConsole:
+        """Return the console that the log of one seed uses."""
+        return SeedConsole(self, seed)
+
+    def add(self, seed: int, iteration: int, metrics: dict[str, float], remaining: float) -> None:
+        """Keep the metrics of a seed for the next `flush`."""
+        self._logged[seed] = metrics
+        self._last = (iteration, remaining)
+
+    def flush(self) -> None:
+        """Show the metrics that the seeds have logged since the last call, if any."""
+        if self._logged:
+            iteration, remaining = self._last
+            self.show(iteration, list(self._logged.values()), remaining)
+            self._logged = {}
+
+
+class SeedConsole:
+    """Console of one of several seeds: its lines begin with the seed, its metrics are shown with those of others."""
+
+    def __init__(self, console: SeedsConsole, seed: int) -> None:
+        """Write to the console of all seeds."""
+        self._console, self._seed = console, seed
+
+    def __enter__(self) -> SeedConsole:
+        """Return this console; that of all seeds is open."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: the console of all seeds stays open."""
+
+    def print_line(self, line: str) -> None:
+        """Print a line with the seed."""
+        self._console.print_line(f"seed {self._seed}: {line}")
+
+    def show(self, iteration: int, seeds: Sequence[dict[str, float]], remaining: float) -> None:
+        """Keep the metrics until those of all seeds are shown."""
+        self._console.add(self._seed, iteration, seeds[0], remaining)
+
+    def print_speed(self, rate: float, remaining: float) -> None:
+        """Print nothing: seeds share the device."""
+
+    def check_rate(self, rate: float) -> None:
+        """Print nothing: seeds share the device."""
+
+
+class TrainingLog:
+    """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
+
+    def __init__(
+        self, folder: Path, config: dict[str, Any], cfg: TrainCfg, iteration: int = 0,
+        console: TrainingConsole | SeedConsole | None = None,
+    ) -> None:  # fmt: skip
+        """Open the metrics file and the other outputs of the log; folder: the run's existing folder.
+
+        config: JSON-ready configuration of the run. cfg: settings of the training. iteration: iterations so far; lines
+        logged of later iterations are removed. console: that shows progress (default: a new one).
+        Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
+        """
+        self.console = TrainingConsole(cfg, iteration) if console is None else console
+        self._file = MetricsFile(folder / METRICS_FILE, iteration)
+        self._events = _event_writer(folder, iteration, config) if cfg.tensorboard else None
+        self._disk_full = False
+        self._wandb = _wandb(cfg.wandb, folder, config, cfg) if cfg.wandb else None
+
+    def __enter__(self) -> TrainingLog:
+        """Show the training's progress bar; report lines that were removed from the metrics file."""
+        self.console.__enter__()
+        if self._file.dropped:
+            self.print_line(f"{self._file.path}: removed {self._file.dropped} incomplete or later lines")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close all outputs of the log: file, terminal, TensorBoard and Weights & Biases."""
+        self.console.__exit__()
+        for close in (self._file.close, *([self._events.close] if self._events else [])):
+            with suppress(OSError):
+                close()
+        if self._wandb:
+            self._wandb.finish()
+
+    def print_line(self, line: str) -> None:
+        """Print a line above the progress bar."""
+        self.console.print_line(line)
+
+    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
+        """Log the metrics of an iteration by name, such as `Loss/value`; remaining: estimated time to the end [s]."""
+        try:
+            self._file.add(iteration, metrics)
+        except OSError as error:
+            if not self._disk_full:
+                path = self._file.path
+                self.print_line(f"{path}: {error.strerror}; training continues, the metrics are written later")
+            self._disk_full = True
+        self._write_events(iteration, metrics)
+        if self._wandb:
+            self._wandb.log(metrics, step=iteration)
+        self.console.show(iteration, [metrics], remaining)
+
+    def print_speed(self, rate: float, remaining: float) -> None:
+        """Print the measured step rate [1/s] and the estimated time to the end [s]."""
+        self.console.print_speed(rate, remaining)
+
+    def check_rate(self, rate: float) -> None:
+        """Print a warning, once, if the step rate [1/s] is low."""
+        self.console.check_rate(rate)
 
     def move(self, folder: Path) -> None:
         """Continue the log in a new folder: copy the metrics file, even if deleted; end TensorBoard. Raises OSError."""
@@ -224,17 +319,33 @@ class _PipeSafeConsole(Console):
         self.quiet = True
 
 
-def _summary(metrics: dict[str, float]) -> str:
-    """Return one line with steps per second and, if in metrics, reward, success rate and curriculum level."""
-    parts = [f"{metrics['Perf/total_fps']:,.0f} steps/s"]
-    if (total := metrics.get("Train/mean_reward")) is not None:
-        parts.append(f"reward {total:.2f}")
-    if (success := metrics.get("Metrics/success")) is not None:
-        parts.append(f"success {100.0 * success:.1f} %")
-    if len(levels := level_fractions(metrics)) > 2:  # with a single level there is no curriculum
-        level = f"mean level {sum(i * part for i, part in enumerate(levels)):.1f} of {len(levels) - 1}"
-        parts.append(level if success is None else f"{parts.pop()} at {level}")
+def _summary(seeds: Sequence[dict[str, float]]) -> str:
+    """Return reward, success rate and curriculum level as text, those that the metrics of all seeds have.
+
+    Of several seeds: means, in brackets their 95 % intervals over the seeds.
+    """
+    parts = [""]
+    if reward := _mean_over(seeds, "Train/mean_reward", "reward {:.2f}", "[{:.2f}, {:.2f}]"):
+        parts.append(reward)
+    if success := _mean_over(seeds, "Metrics/success", "success {:.1%}", "[{:.1%}, {:.1%}]"):
+        parts.append(success.replace("%", " %"))
+    levels = [level_fractions(metrics) for metrics in seeds]
+    if len(levels[0]) > 2:  # with a single level there is no curriculum
+        mean = sum(i * part for each in levels for i, part in enumerate(each)) / len(levels)
+        level = f"mean level {mean:.1f} of {len(levels[0]) - 1}"
+        parts.append(f"{parts.pop()} at {level}" if success else level)
     return ", ".join(parts)
+
+
+def _mean_over(seeds: Sequence[dict[str, float]], name: str, form: str, interval: str) -> str:
+    """Return the mean of a metric over seeds as text, in brackets its interval if there are several; "": not logged."""
+    values = [metrics[name] for metrics in seeds if name in metrics]
+    if not values:
+        return ""
+    measured = mean(values)
+    if len(seeds) == 1 or measured.value is None or measured.interval is None:
+        return form.format(values[0] if measured.value is None else measured.value)
+    return f"{form.format(measured.value)} {interval.format(*measured.interval)}"
 
 
 def level_fractions(metrics: dict[str, float]) -> list[float]:
@@ -242,17 +353,29 @@ def level_fractions(metrics: dict[str, float]) -> list[float]:
     return [value for name, value in metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
 
 
-def _event_writer(folder: Path, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides events after `iteration` in older event files."""
+def _event_writer(folder: Path, iteration: int, config: dict[str, Any]) -> Any:
+    """Return a TensorBoard writer with the settings as hparams; it hides events after `iteration` in older files."""
     from torch.utils.tensorboard import SummaryWriter
+    from torch.utils.tensorboard.summary import hparams
 
-    return SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
+    writer = SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
+    settings = {name: value for name, value in flat_settings(config).items() if isinstance(value, (bool, int, float))}
+    for summary in hparams(settings, {"Metrics/success": 0.0}):
+        writer._get_file_writer().add_summary(summary)
+    return writer
 
 
-def _wandb(folder: Path, config: dict[str, Any]) -> Any:
-    """Start a run of Weights & Biases for a training, and return it. Raises InputError: it is not installed."""
+def _wandb(project: str, folder: Path, config: dict[str, Any], cfg: TrainCfg) -> Any:
+    """Start a run of Weights & Biases for a training, and return it; seeds of a run form a group.
+
+    Raises InputError: it is not installed.
+    """
     try:
         wandb = importlib.import_module("wandb")
     except ImportError as error:
         raise InputError("wandb is requested but not installed: pip install wandb") from error
-    return wandb.init(project="jumper-warp", dir=str(folder), config=config)
+    group = title(folder.parent) if folder.name.startswith(SEED) else None
+    return wandb.init(
+        project=project, dir=str(folder), config=config, name=title(folder), group=group, tags=list(cfg.tags),
+        reinit="create_new",
+    )  # fmt: skip

@@ -13,14 +13,14 @@ import torch
 from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW, SESSION
 from jumper_warp.rl.checkpoint import (
     DECODE_ERRORS,
-    MANIFEST,
     Checkpoint,
     CheckpointError,
+    checkpoint_names,
     latest_checkpoint,
     load_checkpoint,
     newest_name,
 )
-from jumper_warp.rl.run_names import newest
+from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, SEED, newest, seed_folders
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.sources import changed_sources
@@ -30,37 +30,60 @@ if TYPE_CHECKING:
     from jumper_warp.rl.cfg import TrainCfg
     from jumper_warp.rl.distributed import Rank
 
-CHECKPOINTS = "checkpoints"  # Folder in a run's folder that holds its checkpoints
 FIXED = (
-    "best-metric", "ppo.init-std", "ppo.normalise-value", "env.motors.lateral.peak", "env.motors.transversal.peak",
-    "robot.values.latency", "robot.values.motor-friction", "robot.values.paw-friction",
+    "best-metric", "run-name", "ppo.init-std", "ppo.normalise-value", "env.motors.lateral.peak",
+    "env.motors.transversal.peak", "robot.values.latency", "robot.values.motor-friction", "robot.values.paw-friction",
 )  # fmt: skip
 """Settings that only the start of a training reads; scores of saved checkpoints are of its `best_metric`."""
 RANGES = ("env.randomization.", "robot.randomization.")  # Begins of the names of ranges of robot parameters
 REDRAWN = ("env.randomization.push", "env.randomization.resample-at", "env.randomization.type")
 """Begins of the names in RANGES that apply during a training in any case."""
+FROZEN = "frozen.txt"  # File in the folder of a seed whose training ended early, with the reason
 DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's configuration that follow from other settings
 
 
-def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Load and return the checkpoint that `TrainCfg.resume` selects; None: start a new run. Raises CheckpointError."""
+def find_checkpoints(cfg: TrainCfg) -> list[Checkpoint]:
+    """Load and return the checkpoints that `TrainCfg.resume` selects: one, or one of each seed that was not frozen.
+
+    Those of several seeds are of the same iteration. Empty: start a new run. Raises CheckpointError.
+    """
     if not cfg.resume:
-        return None
+        return []
+    path = Path(cfg.resume)
     if cfg.resume in (LATEST, LATEST_OR_NEW):
         runs = cfg.log_root / cfg.task
-        if run := newest(path.parents[1] for path in runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}")):
-            return latest_checkpoint(run / CHECKPOINTS)
-        if cfg.resume == LATEST_OR_NEW:
-            return None
-        raise CheckpointError(f"{runs}: no run to resume")
-    path = Path(cfg.resume)
+        found = runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}"), runs.glob(f"*/{SEED}*/{CHECKPOINTS}/{MANIFEST}")
+        run = newest([*(file.parents[1] for file in found[0]), *(file.parents[2] for file in found[1])])
+        if run is None and cfg.resume == LATEST_OR_NEW:
+            return []
+        if run is None:
+            raise CheckpointError(f"{runs}: no run to resume")
+        path = run
+    if folders := seed_folders(path):
+        return _common_checkpoints(path, [folder for folder in folders.values() if not (folder / FROZEN).exists()])
     folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
     if not (folder / MANIFEST).is_file():
         reason = "no run to resume" if path.exists() else "no such file or folder, no run to resume"
         raise CheckpointError(f"{path}: {reason}; pass a run's folder, one of its checkpoints, or latest")
     if path.suffix == ".pt":
-        return Checkpoint(path, load_checkpoint(path), [], newest_name(folder))
-    return latest_checkpoint(folder)
+        return [Checkpoint(path, load_checkpoint(path), [], newest_name(folder))]
+    return [latest_checkpoint(folder)]
+
+
+def _common_checkpoints(run: Path, folders: list[Path]) -> list[Checkpoint]:
+    """Return the checkpoints of the last iteration that the folders of all seeds have. Raises CheckpointError."""
+    names = [checkpoint_names(folder / CHECKPOINTS) for folder in folders]
+    skipped: list[str] = []
+    for name in sorted(set.intersection(*map(set, names)), reverse=True) if names else []:
+        paths = [folder / CHECKPOINTS / name for folder in folders]
+        try:
+            states = [load_checkpoint(path) for path in paths]
+        except CheckpointError as error:
+            skipped.append(str(error))
+            continue
+        parts = zip(paths, states, names, strict=True)
+        return [Checkpoint(path, state, skipped, saved[-1]) for path, state, saved in parts]
+    raise CheckpointError("; ".join([f"{run}: its seeds have no usable checkpoint of the same iteration", *skipped]))
 
 
 def check_unchanged(checkpoint: Checkpoint) -> None:
@@ -101,7 +124,7 @@ def changed_settings(state: Json, config: Json) -> dict[str, str]:
     Empty if the checkpoint has no readable configuration.
     """
     try:
-        old, new = _settings(json.loads(state["config"])), _settings(config)
+        old, new = flat_settings(json.loads(state["config"])), flat_settings(config)
     except DECODE_ERRORS:
         return {}
     changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
@@ -131,7 +154,7 @@ def changed_user_files(state: Json, config: Json) -> list[str]:
         return []
 
 
-def _settings(config: Json) -> Json:
+def flat_settings(config: Json) -> Json:
     """Return the settings in a run's configuration as a flat dict by flag name, without leading dashes."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
@@ -163,28 +186,30 @@ def saved_seconds(state: Json) -> float:
     return float(seconds)
 
 
-def random_state() -> dict[str, torch.Tensor]:
-    """Return the states of torch's default random generators: `cpu`, and `cuda` if there is a GPU."""
-    state = {"cpu": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        state["cuda"] = torch.cuda.get_rng_state()
-    return state
+def random_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """Return the states of a learner's random generator, `learner`, and of torch's default one, `cpu`."""
+    return {"cpu": torch.get_rng_state(), "learner": generator.get_state()}
 
 
-def set_random_state(state: dict[str, torch.Tensor]) -> None:
-    """Set torch's default random generators to states from `random_state`; the GPU's only where there is a GPU.
+def set_random_state(state: dict[str, torch.Tensor], generator: torch.Generator) -> None:
+    """Set a learner's random generator, and torch's default one, to states from `random_state`.
 
-    Raises InputError: a part is missing or not a generator's state; nothing is changed.
+    Checkpoints of earlier versions lack `learner`; their learner used torch's default generator of its device. A state
+    of another kind of device changes nothing.
+    Raises InputError: a part is missing or not a generator's state.
     """
-    current = random_state()
     if not isinstance(state, dict) or "cpu" not in state:
         raise InputError("rng lacks cpu")
-    for name in current.keys() & state.keys():
-        check_tensor(state[name], current[name], f"rng.{name}")
+    current = random_state(generator)
+    learner = state.get("learner", state.get(generator.device.type))
+    parts = {"cpu": (state["cpu"], torch.default_generator)}
+    if learner is not None and learner.shape == current["learner"].shape:
+        parts["learner"] = (learner, generator)
+    for name, (part, _) in parts.items():
+        check_tensor(part, current[name], f"rng.{name}")
     try:
-        torch.set_rng_state(state["cpu"])
-        if "cuda" in current.keys() & state.keys():
-            torch.cuda.set_rng_state(state["cuda"])
+        for part, each in parts.values():
+            each.set_state(part)
     except RuntimeError as error:
         torch.set_rng_state(current["cpu"])
         raise InputError(f"rng is not the state of a generator: {error}") from error

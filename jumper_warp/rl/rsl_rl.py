@@ -141,4 +141,4 @@ def run_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl, rank: Rank) -> Tr
         raise SystemExit(f"jumper: {failure}")
     if stop.requested:
         raise SystemExit(INTERRUPTED)
-    return TrainResult(folder, iteration, time.perf_counter() - begin, {})
+    return TrainResult(folder, iteration, time.perf_counter() - begin, {}, {})

@@ -30,13 +30,14 @@ class TrainResult(NamedTuple):
     folder: Path  # the run's folder
     iteration: int  # number of iterations, over all resumes
     seconds: float  # wall-clock time of this process's iterations [s], including the first
-    metrics: dict[str, float]  # last logged metrics
+    metrics: dict[str, float]  # last logged metrics; of several seeds their means
+    seeds: dict[int, TrainResult]  # results of the seeds of this process by seed; empty: one training
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
-    """Create the folder of a new training run, log_root/task/time, on rank 0, and return its path on all ranks."""
+    """Create the folder of a new training run, see `run_name`, on rank 0, and return its path on all ranks."""
     (microseconds,) = all_reduce_max([time.time_ns() // 1000 if rank.index == 0 else 0])
-    folder = cfg.log_root / cfg.task / run_name(microseconds)
+    folder = cfg.log_root / cfg.task / run_name(microseconds, cfg.run_name)
     if rank.index == 0:
         folder.mkdir(parents=True)
     return folder

@@ -6,9 +6,9 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -23,9 +23,8 @@ from jumper_warp.rl.clock import TrainingClock, is_last_iteration
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
-from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingLog
+from jumper_warp.rl.logger import NoLog, Scores, SeedConsole, Stopwatch, TrainingConsole, TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import (
     CONFIG,
     INTERRUPTED,
@@ -37,6 +36,7 @@ from jumper_warp.rl.run_folder import (
     rescue_folder,
     write_config,
 )
+from jumper_warp.rl.run_names import CHECKPOINTS, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
@@ -64,19 +64,14 @@ def train(
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if a signal stopped the training (`StopRequest`),
-    with a message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted.
+    with a message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted; without one
+    if weights are not finite.
     """
-    set_threads(cfg.threads)
-    rank = distributed.init_distributed(cfg.device, cfg.threads)
     with ExitStack() as cleanup:
-        cleanup.callback(_leave_process_group)
-        cfg.check_processes(rank.size)
-        checkpoint = checkpoint or resume.find_checkpoint(cfg)
-        if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
-            raise InputError("init_policy and actor_init, which is made from it, must be passed together")
+        rank = prepare(cfg, actor_init, checkpoint, cleanup)
+        checkpoint = checkpoint or next(iter(resume.find_checkpoints(cfg)), None)
         if checkpoint is not None and rank.index == 0:
-            cleanup.enter_context(write_lock(checkpoint.path.parent.parent))
-            resume.check_unchanged(checkpoint)
+            lock(checkpoint, cleanup)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             if as_rsl_rl is None:
@@ -89,22 +84,68 @@ def train(
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))
-        try:
-            with StopRequest() as stop:
-                result = run.iterate(stop)
-        except Exception as error:
-            if any((run.folder / CHECKPOINTS).glob("*.pt")):
-                error.add_note(f"continue from the last checkpoint with: {run.resume_command}")
-            raise
+        stop = iterate([run])
         distributed.wait_for_ranks()
-        if run.failure:
-            raise SystemExit(f"jumper: {run.failure}")  # printed by Python, which exits with status 1
-        if stop.requested:
-            raise SystemExit(INTERRUPTED)
-        return result
+        return finish(run.result(), [run], stop)
 
 
-def _leave_process_group() -> None:
+def prepare(cfg: TrainCfg, actor_init: ActorInit | None, resumed: object, cleanup: ExitStack) -> Rank:
+    """Set threads and device of this process, join its process group until `cleanup` ends, and return the rank.
+
+    Raises InputError: the settings do not fit; init_policy and actor_init are not passed together.
+    """
+    set_threads(cfg.threads)
+    rank = distributed.init_distributed(cfg.device, cfg.threads)
+    cleanup.callback(leave_process_group)
+    cfg.check_processes(rank.size)
+    if not resumed and not cfg.resume and bool(cfg.init_policy) != (actor_init is not None):
+        raise InputError("init_policy and actor_init, which is made from it, must be passed together")
+    return rank
+
+
+def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda: None) -> StopRequest:
+    """Run trainings side by side, until the last iteration, the time limit or a stop request; return the latter.
+
+    on_logged: called after each iteration.
+    """
+    try:
+        with StopRequest() as stop, ExitStack() as opened:
+            for run in runs:
+                opened.enter_context(run.open())
+            while active := [run for run in runs if not run.ended]:
+                for run in active:
+                    with run.stream:
+                        run.launch()
+                stop.can_abort = False
+                ends = [run.is_end_requested(stop) for run in active]
+                for run in active:
+                    with run.stream:
+                        run.conclude(stop, any(ends))
+                on_logged()
+                stop.can_abort = True
+            return stop
+    except Exception as error:
+        if any(any((run.folder / CHECKPOINTS).glob("*.pt")) for run in runs):
+            error.add_note(f"continue from the last checkpoint with: {runs[0].resume_command}")
+        raise
+
+
+def finish(result: TrainResult, runs: Sequence[TrainingRun], stop: StopRequest) -> TrainResult:
+    """Return the result of trainings that ended. Raises SystemExit: all failed, or a signal stopped them."""
+    if all(run.failure for run in runs):
+        raise SystemExit(f"jumper: {runs[0].failure}")  # printed by Python, which exits with status 1
+    if stop.requested:
+        raise SystemExit(INTERRUPTED)
+    return result
+
+
+def lock(checkpoint: Checkpoint, cleanup: ExitStack) -> None:
+    """Lock the folder of a run that is resumed from a checkpoint. Raises InputError or CheckpointError as `train`."""
+    cleanup.enter_context(write_lock(checkpoint.path.parent.parent))
+    resume.check_unchanged(checkpoint)
+
+
+def leave_process_group() -> None:
     """Leave torch's process group, if this process is in one."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
@@ -115,14 +156,18 @@ class TrainingRun:
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
+        checkpoint: Checkpoint | None = None, expected_rate: float = 0.0, *, folder: Path | None = None,
+        console: TrainingConsole | SeedConsole | None = None, stream: AbstractContextManager[None] | None = None,
     ) -> None:  # fmt: skip
-        """Build the algorithm, and load the checkpoint of cfg.resume, else apply `actor_init` if given.
+        """Build the algorithm, and load the checkpoint, else apply `actor_init` if given.
 
-        command, actor_init, checkpoint, expected_rate: as in `train`. Raises InputError or CheckpointError as `train`.
+        command, actor_init, checkpoint, expected_rate: as in `train`. folder: of a new run (default: a new one, by
+        time). console: shows lines and progress (default: a new one). stream: context in which all work of the run is
+        enqueued (default: the current stream). Raises InputError or CheckpointError as `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
-        self._command, self._expected_rate = command or f"jumper train {cfg.task}", expected_rate
+        self._command = command or f"jumper train {cfg.task}"
+        self.stream = nullcontext() if stream is None else stream
         self.ppo = make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in STATISTICS}
         logged = {*env.metrics(), *losses, *LEARNING, *PERF}
@@ -131,20 +176,31 @@ class TrainingRun:
             raise InputError(f"best_metric must name a logged metric, such as {examples}, got {cfg.best_metric!r:.60}")
         self.config = full_config(cfg, env, rank)
         self.iteration = 0
+        self.ended = False
         self.clock = TrainingClock(cfg)
         self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
         self.metrics: dict[str, float] = {}
         self._scores = Scores(cfg.best_metric)
         self.notes: list[str] = []
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
-        checkpoint = checkpoint or resume.find_checkpoint(cfg)
+        self._is_finite = True  # Whether the weights are finite, else they are not saved
         if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder shared by all")
         if actor_init is not None and checkpoint is None:
             apply_actor_init(actor_init, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
             self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", actor_init.change))))
-        torch.manual_seed(cfg.seed + 1 + rank.index)
-        self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
+        self.ppo.generator.manual_seed(cfg.seed + 1 + rank.index)
+        if checkpoint is not None:
+            self.folder = self._resume(checkpoint)
+        elif folder is not None:
+            self.folder = folder
+            folder.mkdir(parents=True)
+        else:
+            self.folder = new_folder(cfg, rank)
+        if console is None:
+            self.notes.insert(0, f"run {self.folder}")
+            console = TrainingConsole(cfg, self.iteration, expected_rate)
+        self._console = console
         if rank.index == 0:
             write_config(self.folder, self.config)
 
@@ -164,7 +220,7 @@ class TrainingRun:
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
             self.clock.seconds = resume.saved_seconds(state)
-            resume.set_random_state(local["rng"])
+            resume.set_random_state(local["rng"], self.ppo.generator)
         except DECODE_ERRORS as error:
             suffix = f" ({', '.join(lines)})" if lines else ""
             raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
@@ -174,59 +230,68 @@ class TrainingRun:
         self.config["train"]["init_policy"] = resume.saved_init_policy(state)
         return path.parent.parent
 
-    def iterate(self, stop: StopRequest) -> TrainResult:
-        """Train until the last iteration, the time limit or a stop request, with logging and checkpoints."""
-        cfg, ppo = self.cfg, self.ppo
-        with ThreadPoolExecutor(1) as pool:
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """Context in which the training can iterate: kernels are compiled, the log is open."""
+        with self.stream, ThreadPoolExecutor(1) as pool:
             kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
-            distributed.local_rank_zero_first(ppo.compile)
+            distributed.local_rank_zero_first(self.ppo.compile)
             kernels.result()
-        if self.iteration == 0:
-            self.env.reset()
-        start, first_iteration = time.perf_counter(), self.iteration + 1
-        watch = Stopwatch(self.rank.device)
-        with self._open_log() as log:
-            for note in [f"run {self.folder}", *self.notes]:
-                log.print_line(note)
-            is_last = is_last_iteration(self.iteration, cfg, self.clock.is_over_time())
-            if is_last:
+            if self.iteration == 0:
+                self.env.reset()
+        self._begin, self._first_iteration = time.perf_counter(), self.iteration + 1
+        self._seconds = 0.0
+        self._watch = Stopwatch(self.rank.device)
+        with self._open_log() as self.log:
+            for note in self.notes:
+                self.log.print_line(note)
+            self.ended = is_last_iteration(self.iteration, self.cfg, self.clock.is_over_time())
+            if self.ended:
                 complete = f"the training is complete at iteration {self.iteration}"
-                log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
-            while not is_last:
-                watch.start()
-                ppo.set_progress(self.clock.progress(self.iteration))
-                ppo.iterate(partial(self._mark, watch, log))
-                stop.can_abort = False
-                self.iteration += 1
-                if self.iteration == first_iteration:
-                    self.clock.start(self.rank.device)
-                is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
-                saves = self.iteration % cfg.save_interval == 0
-                logs = saves or self.iteration % cfg.log_interval == 0  # a checkpoint's score is of its last iterations
-                if is_last or logs or saves or cfg.stop_on_nan:
-                    self._check(log)
-                    is_last = is_last or bool(self.failure and self.rank.size == 1)
-                if is_last or logs:
-                    (times, seconds), self._is_timed = watch.read(), True
-                    self.metrics = self._read_metrics(times)
-                    self._scores.add(self.metrics)
-                    log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
-                elif self.iteration == first_iteration or not self._is_timed:
-                    self._print_speed(log, watch, self.iteration == first_iteration)
-                if is_last and not self.failure:
-                    log.print_line(f"ended by {self._reason(stop)}")
-                if is_last or saves:
-                    self._save(log, is_last, stop)
-                stop.can_abort = True
-        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
+                self.log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
+            yield
+
+    def launch(self) -> None:
+        """Enqueue an iteration on the device."""
+        self._watch.start()
+        self.ppo.set_progress(self.clock.progress(self.iteration))
+        self.ppo.iterate(self._mark)
+
+    def conclude(self, stop: StopRequest, ends: bool) -> None:
+        """Count the iteration that was launched; log and save it where it is due. ends: whether it is the last one."""
+        cfg, log, watch = self.cfg, self.log, self._watch
+        self.iteration += 1
+        if self.iteration == self._first_iteration:
+            self.clock.start(self.rank.device)
+        is_last = is_last_iteration(self.iteration, cfg, ends)
+        saves = self.iteration % cfg.save_interval == 0
+        logs = saves or self.iteration % cfg.log_interval == 0  # a checkpoint's score is of its last iterations
+        if is_last or logs or saves or cfg.stop_on_nan:
+            self._check()
+            is_last = is_last or bool(self.failure and self.rank.size == 1)
+        if is_last or logs:
+            (times, seconds), self._is_timed = watch.read(), True
+            self.metrics = self._read_metrics(times)
+            self._scores.add(self.metrics)
+            log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
+        elif self.iteration == self._first_iteration or not self._is_timed:
+            self._print_speed(self.iteration == self._first_iteration)
+        if is_last and not self.failure:
+            log.print_line(f"ended by {self._reason(stop)}")
+        if (is_last or saves) and self._is_finite:
+            self._save(is_last, stop)
+        self._seconds = time.perf_counter() - self._begin
+        self.ended = is_last
+
+    def result(self) -> TrainResult:
+        """Return the training's result so far."""
+        return TrainResult(self.folder, self.iteration, self._seconds, self.metrics, {})
 
     def _open_log(self) -> TrainingLog | NoLog:
         """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
         if self.rank.index != 0:
             return NoLog()
-        cfg = self.cfg
-        outputs = (cfg.max_iterations, self._steps(), cfg.tensorboard, cfg.wandb)
-        return TrainingLog(self.folder, self.config, *outputs, self.iteration, self._expected_rate)
+        return TrainingLog(self.folder, self.config, self.cfg, self.iteration, self._console)
 
     def _steps(self) -> int:
         """Return the number of environment steps in an iteration, of all worlds."""
@@ -238,33 +303,36 @@ class TrainingRun:
         steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
         return f"{'an interruption' if stop.requested else self.clock.limit(self.iteration)}{steps}"
 
-    def _mark(self, watch: Stopwatch, log: TrainingLog | NoLog) -> None:
+    def _mark(self) -> None:
         """Mark the end of a part of an iteration for timing; warn of a low step rate in a long first iteration."""
-        watch.mark()
-        if not self.clock.started and (seconds := watch.lap_time()) > WARM_UP:
-            log.check_rate(self._steps() / seconds)
+        self._watch.mark()
+        if not self.clock.started and (seconds := self._watch.lap_time()) > WARM_UP:
+            self.log.check_rate(self._steps() / seconds)
 
-    def _print_speed(self, log: TrainingLog | NoLog, watch: Stopwatch, is_first: bool) -> None:
+    def _print_speed(self, is_first: bool) -> None:
         """Print a CPU's training speed; the first iteration counts only if it takes much longer than warm-up."""
-        times, seconds = watch.read()
+        times, seconds = self._watch.read()
         if not self._is_timed and (seconds > WARM_UP or not is_first):
-            log.print_speed(self._steps() / sum(times), self.clock.remaining(self.iteration, seconds))
+            self.log.print_speed(self._steps() / sum(times), self.clock.remaining(self.iteration, seconds))
             self._is_timed = True
 
-    def _check(self, log: TrainingLog | NoLog) -> None:
-        """Report NaN and infinite terms; set `failure` if one of them or a deleted run folder ends the training."""
-        folder, print_line = self.folder, partial(print, file=sys.stderr)
+    def _check(self) -> None:
+        """Report NaN and infinite terms; set `failure` if one, the weights or a deleted run folder end the training."""
+        folder, log, print_line = self.folder, self.log, partial(print, file=sys.stderr)
         if isinstance(log, TrainingLog):
             print_line = log.print_line
             self.folder, failure = rescue_folder(folder, self.config, (CONFIG, METRICS_FILE))
             self.failure = self.failure or failure
             if self.folder != folder:
                 log.move(self.folder)
+        self._is_finite = self.ppo.is_finite()
+        if not self._is_finite:
+            self.failure = self.failure or "the weights are not finite; the last checkpoint is the one before"
         found = report_non_finite(self.env, self.folder, self.config, self.iteration, print_line, self.rank.index)
         if found and self.cfg.stop_on_nan:
             self.failure = self.failure or f"--stop-on-nan: {found[0]}"
 
-    def sync_stop_request(self, stop: StopRequest) -> bool:
+    def is_end_requested(self, stop: StopRequest) -> bool:
         """Return whether to end the training: a process has a stop request, a failure, or reached the time limit.
 
         Several processes synchronise this, `stop.requested` and `failure` only in logged iterations.
@@ -284,13 +352,17 @@ class TrainingRun:
         perf = (self._steps() / sum(times), *times, self.clock.elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
-    def _save(self, log: TrainingLog | NoLog, is_last: bool, stop: StopRequest) -> None:
+    def _save(self, is_last: bool, stop: StopRequest) -> None:
         """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one.
 
         It also holds the states of the other ranks' environments, so that a resumed training continues identically.
         """
         seconds = self.clock.elapsed()
-        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
+        local = {
+            "ppo": self.ppo.state_dict(),
+            "env": self.env.state_dict(),
+            "rng": resume.random_state(self.ppo.generator),
+        }
         others = distributed.other_states(local, self.rank)
         if self.rank.index != 0:
             return
@@ -302,14 +374,15 @@ class TrainingRun:
         except OSError as error:
             if is_last:
                 raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
-            log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
+            self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         self._scores.clear()
         if is_last:
             hint = f", continue with: {self.resume_command}"
-            log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
+            self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 
     @property
     def resume_command(self) -> str:
-        """Command line that resumes this run."""
-        return f"{self._command} --resume {shlex.quote(str(self.folder))}"
+        """Command line that resumes this run, with all its seeds."""
+        folder = self.folder.parent if self.folder.name.startswith(SEED) else self.folder
+        return f"{self._command} --resume {shlex.quote(str(folder))}"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from numbers import Real
 from types import ModuleType
 from typing import Any, cast
 
@@ -93,8 +94,8 @@ def build_model(
             unknown `ground`.
     """
     num_worlds = check_count("num_worlds", num_worlds)
-    if not 0.0 <= friction <= MAX_FRICTION:
-        raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
+    if not isinstance(friction, Real) or not 0.0 <= friction <= MAX_FRICTION:
+        raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction!r:.40}")
     check_gravity(gravity)
     init_warp()
     description = load_description() if description is None else description

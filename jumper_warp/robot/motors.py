@@ -131,8 +131,10 @@ def motor_arrays(
 
     Arrays are (12, num_worlds), without sensor offsets. module: `jumper_warp.kernels.actuation.motors` in either
     precision. robot: factors on gains and torque limits, speeds and sensor offsets of one robot (N = 1) or of every
-    world (N = num_worlds).
+    world (N = num_worlds). Raises InputError: cfg is no MotorCfg.
     """
+    if not isinstance(cfg, MotorCfg):
+        raise InputError(f"motors must be a MotorCfg, got {cfg!r:.60}")
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
         """Return a constant of the two kinds of motors for every motor and world, (12, num_worlds)."""
@@ -222,8 +224,10 @@ def loose_filter() -> FilterCfg:
 def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> KernelStruct:
     """Return the motor command filter's settings as the struct that the kernels read, angles in radians.
 
-    module: `command_filter` in either precision.
+    module: `command_filter` in either precision. Raises InputError: cfg is no FilterCfg.
     """
+    if not isinstance(cfg, FilterCfg):
+        raise InputError(f"command_filter must be a FilterCfg or None, got {cfg!r:.60}")
     params = module.FilterParams()
     for name in ("lateral", "transversal", "sum"):
         limits = module.Limits()
@@ -238,8 +242,10 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Ker
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
     """Return the command filter's settings as an array (14,), in the order and units of `FILTER_NAMES`.
 
-    cfg: None for the filter of vertical jumps.
+    cfg: None for the filter of vertical jumps. Raises InputError: it is no FilterCfg.
     """
-    cfg = cfg or vertical_jump_filter()
+    cfg = vertical_jump_filter() if cfg is None else cfg
+    if not isinstance(cfg, FilterCfg):
+        raise InputError(f"command_filter must be a FilterCfg or None, got {cfg!r:.60}")
     angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]
     return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

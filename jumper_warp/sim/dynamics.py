@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+from numbers import Real
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -70,7 +71,7 @@ def check_step(dt: float, substeps: int = 1) -> int:
 
     Raises InputError: dt [s] not in the range DT, or substeps no whole number from 1 to MAX_SUBSTEPS.
     """
-    if not DT[0] <= dt <= DT[1]:
+    if not isinstance(dt, Real) or not DT[0] <= dt <= DT[1]:
         raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
     return check_count("substeps", substeps, MAX_SUBSTEPS)
 
@@ -247,7 +248,7 @@ class JumperDynamics:
         """
         if max_sweeps < 1:
             raise InputError(f"max_sweeps must be at least 1, got {max_sweeps}")
-        if not 0.0 < tolerance < math.inf:
+        if not isinstance(tolerance, Real) or not 0.0 < tolerance < math.inf:
             raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
         check_model(model)
         self.model = model

@@ -166,7 +166,9 @@ class Simulation(Uncopied):
         self.block = block
         self.dt = dt
         self.substeps = substeps
-        self.motors = motor_arrays(motors or jumping_motors(), num_worlds, device=self.device, robot=values)
+        self.motors = motor_arrays(
+            jumping_motors() if motors is None else motors, num_worlds, device=self.device, robot=values
+        )
         self._filter = None if command_filter is None else filter_params(command_filter)
         self._make_arrays()
         if solver == "jumper":
@@ -220,8 +222,6 @@ class Simulation(Uncopied):
 
         Raises InputError: another shape or type, or not finite.
         """
-        if hasattr(angles, "detach"):
-            angles = cast("torch.Tensor", angles).detach().cpu()
         values = real_array(angles, "targets")
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
@@ -260,7 +260,10 @@ class Simulation(Uncopied):
         if hasattr(mask, "is_cuda"):
             mask = wp.from_torch(cast("torch.Tensor", mask).contiguous())
         elif not isinstance(mask, wp.array):
-            mask = wp.array(np.asarray(mask), device=self.device)
+            values = np.asarray(mask)
+            if values.dtype != bool:
+                raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {values.dtype} {values.shape}")
+            mask = wp.array(values, dtype=wp.bool, device=self.device)
         if mask.dtype is not wp.bool or mask.shape != (self.num_worlds,):
             raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {mask.dtype} {mask.shape}")
         wp.copy(self._mask, mask, count=self.num_worlds)

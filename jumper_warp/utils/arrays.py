@@ -14,11 +14,15 @@ from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file, write_atomi
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float32) -> np.ndarray:
-    """Return a number, list or array as an array of a floating-point `dtype`; name: for messages.
+    """Return a number, list, array or torch tensor as an array of a floating-point `dtype`; name: for messages.
 
-    Raises InputError: it is not rectangular, or holds other than integers and floating-point numbers.
+    Raises InputError: it is not rectangular, masked, or holds other than integers and floating-point numbers.
     """
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
     try:
+        if np.ma.is_masked(values):
+            raise TypeError("some values are masked")
         array = np.asarray(values)
         if array.dtype.kind not in "fiu":
             raise TypeError(f"values of type {array.dtype}")

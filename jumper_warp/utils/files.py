@@ -91,9 +91,13 @@ def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: Error
 def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
     """Return the bytes of a regular file; arguments and errors are those of `existing_file`."""
     try:
-        return existing_file(path, purpose, limit, error).read_bytes()
+        with existing_file(path, purpose, limit, error).open("rb") as file:
+            data = file.read(limit + 1)  # not more: another process may append to the file
     except OSError as problem:  # such as a file of the kernel that has no content
         raise error(f"{path}: cannot be read: {problem} ({purpose})") from None
+    if len(data) > limit:
+        raise error(f"{path}: larger than {limit >> 20} MiB ({purpose})")
+    return data
 
 
 def read_json(

@@ -1,12 +1,15 @@
 """Device, package versions and git commit of a run, for its output."""
 
+from __future__ import annotations
+
 import functools
 import subprocess
 import sys
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import warp as wp
 
@@ -15,6 +18,9 @@ from jumper_warp.utils.files import Json
 from jumper_warp.utils.startup import open_standard_streams
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
+
+if TYPE_CHECKING:
+    import torch
 
 PACKAGES = ("warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
 """Installed distributions whose version can change a result."""
@@ -133,3 +139,24 @@ def versions() -> dict[str, str | None]:
         except metadata.PackageNotFoundError:
             by_package[package] = None
     return by_package
+
+
+class DeviceStream:
+    """Context in which PyTorch and Warp enqueue work on a GPU stream of its own; on a CPU it does nothing."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Create a stream on a device of PyTorch."""
+        self._stream = wp.Stream(str(device)) if device.type == "cuda" else None
+        self._entered = ExitStack()
+
+    def __enter__(self) -> None:
+        """Make the stream the current one of PyTorch and of Warp."""
+        if self._stream is not None:
+            import torch
+
+            self._entered.enter_context(wp.ScopedStream(self._stream, sync_enter=False))
+            self._entered.enter_context(torch.cuda.stream(wp.stream_to_torch(self._stream)))
+
+    def __exit__(self, *_: object) -> None:
+        """Make the previous streams the current ones."""
+        self._entered.close()

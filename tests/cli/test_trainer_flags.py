@@ -9,7 +9,7 @@ from jumper_warp.rl.cfg import PpoCfg
 
 @pytest.mark.parametrize(
     ("trainer", "flags"),
-    [("rsl-rl", ["--ppo.reward-scale", "0.6"]), ("rsl-rl", ["--wandb", "--ppo.no-graphs", "--ppo.min_lr=1e-5"])],
+    [("rsl-rl", ["--ppo.reward-scale", "0.6"]), ("rsl-rl", ["--wandb=mine", "--ppo.no-graphs", "--ppo.min_lr=1e-5"])],
 )
 def test_refuses_flags_that_the_trainer_does_not_use(trainer, flags, capsys, tmp_path):
     code, out, err = run(

@@ -265,7 +265,7 @@ def test_refuses_weights_in_another_file_than_the_checksum_covers(tmp_path, monk
     ("speed", "values"), [(math.nan, (0.0, 4)), ("x", (0.0, 4)), (0.75, (1.0e30, 4)), (0.75, (0.0, 5))]
 )
 def test_jump_command_refuses_implausible_values(speed, values):  # vertical velocity [m/s], paws down
-    with pytest.raises(InputError, match=r"takeoff_speed must be|vertical_velocity must be"):
+    with pytest.raises(InputError, match=r"takeoff_speed must be|vertical_velocity must be|paws_down must be"):
         JumpCommand(speed).update(*values)
 
 

@@ -61,7 +61,7 @@ def _interpret():
     os.environ["TRITON_INTERPRET"] = "1"
     from jumper_warp.rl.fused import networks
 
-    networks.SPLITS = 4  # the interpreter runs one block after the other
+    networks.SPLIT_ROWS = 8  # several splits of small minibatches
 
 
 def minibatch_gradients(cfgs):

@@ -310,6 +310,7 @@ def test_load_state_dict_resumes_bitwise():
     other.load_state_dict(ppo.state_dict())
     for each in (ppo, other):
         torch.manual_seed(5)
+        each.generator.manual_seed(6)
         each.env.reset()
         each.collect()
         each.update()

@@ -16,6 +16,7 @@ from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Scores
 from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.rsl_rl import train_rsl_rl
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
 from jumper_warp.utils.errors import InputError
@@ -354,7 +355,9 @@ def test_score_of_a_checkpoint_that_could_not_be_saved_counts_for_the_next(cfg):
 def resumed_state(cfg, folder, **ppo):
     """Resume a training with other settings of PPO for no iteration; return its `Ppo` and printed notes."""
     cfg = dataclasses.replace(cfg, resume=str(folder), ppo=dataclasses.replace(cfg.ppo, **ppo))
-    run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    (checkpoint,) = find_checkpoints(cfg)
+    env = make_env(cfg.num_envs, 1, "cpu")
+    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")), checkpoint=checkpoint)
     return run.ppo, run.notes
 
 

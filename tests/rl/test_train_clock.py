@@ -8,8 +8,8 @@ import torch
 
 from jumper_warp.rl.checkpoint import CheckpointError, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, train
-from jumper_warp.rl.stop_request import StopRequest
+from jumper_warp.rl.resume import find_checkpoints
+from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, iterate, train
 from test_train import final_state
 from toy_task import SMALL, PushTask, push_cfg
 
@@ -64,9 +64,9 @@ def resume_clocked(monkeypatch, cfg, seconds, limit):
     env = ClockedTask(cfg.num_envs, durations=[1.0 / 128.0] * 160)
     monkeypatch.setattr(time, "perf_counter", lambda: env.now)
     cfg = dataclasses.replace(cfg, max_seconds=limit, resume=str(half.folder))
-    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")))
-    with StopRequest() as stop:
-        return run, run.iterate(stop)
+    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")), checkpoint=find_checkpoints(cfg)[0])
+    iterate([run])
+    return run, run.result()
 
 
 def test_resumed_run_continues_the_training_time(cfg, monkeypatch):

@@ -5,11 +5,14 @@ import json
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, push_cfg
+
+LOGGED = TrainCfg(num_envs=1250, max_iterations=10, tensorboard=False, ppo=PpoCfg(num_steps=40))  # 50,000 steps each
 
 METRICS = {"Perf/total_fps": 1234.0, "Perf/elapsed_s": 5.0, "Metrics/success": 0.5}  # steps per second, time, fraction
 
@@ -34,7 +37,7 @@ def event_steps(folder):
 
 def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     terms = {"Episode_Reward/tilt": float("nan"), "hop/Episode_Reward/fall": float("inf")}
-    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
+    with TrainingLog(tmp_path, {}, LOGGED) as log:
         log.log(1, METRICS | {"Episode_Reward/tilt": 0.5}, remaining=5.0)
         for iteration in (2, 3):
             log.log(iteration, METRICS | terms | {"Loss/value": 1.0}, remaining=5.0)
@@ -49,7 +52,7 @@ def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
 
 def test_line_shows_steps_mean_curriculum_level_and_time_left(tmp_path, capsys):
     levels = {f"Curriculum/fraction_at_level_{i}": part for i, part in enumerate((0.2, 0.6, 0.2))}
-    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
+    with TrainingLog(tmp_path, {}, LOGGED) as log:
         log.log(3, METRICS | levels, remaining=240.0)
     line = "iteration 3/10, 0.15 M steps: 1,234 steps/s, success 50.0 % at mean level 1.0 of 2, 4 min left"
     assert capsys.readouterr().err.splitlines() == [line]
@@ -65,8 +68,8 @@ def test_broken_pipe_or_closed_terminal_does_not_stop_logging(tmp_path, monkeypa
         flush = fileno = isatty = lambda self: 0
 
     monkeypatch.setenv("FORCE_COLOR", "1" if terminal else "")
-    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
-        log._console.file = Broken()
+    with TrainingLog(tmp_path, {}, LOGGED) as log:
+        log.console._console.file = Broken()
         for iteration in (1, 2):
             log.log(iteration, METRICS, remaining=5.0)
     assert iterations(tmp_path / METRICS_FILE) == [1, 2]

@@ -94,13 +94,16 @@ class FusedCollector:
         self.episode, self.finished = (torch.zeros(n, worlds, **counts) for n in (2, 3))  # as in `Collector`
 
     @torch.no_grad()
-    def roll(self) -> None:
-        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout."""
+    def roll(self, generator: torch.Generator | None = None) -> None:
+        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout.
+
+        generator: of the exploration noise (default: torch's).
+        """
         self.obs.begin()
         self.critic_obs.begin()
         self._fused.copy_weights()
         self.rollout.log_std.copy_(self._log_std)
-        self.rollout.action.normal_()
+        self.rollout.action.normal_(generator=generator)
         for step in range(self.cfg.num_steps):
             self.act(step)
             self.env.step(self.rollout.action[step])

@@ -22,7 +22,8 @@ from jumper_warp.utils.threads import available_threads
 
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
-SPLITS = 64  # Number of splits of the samples whose sums are added in a fixed order; a power of two
+MOST_SPLITS = 64  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
+SPLIT_ROWS = 256  # Smallest number of samples in a split; shorter ones cost more for their partial sums than they save
 MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
 _noted: list[tuple[Any, tuple, dict[str, Any]]] | None = None  # Kernels to compile, with arguments and options
@@ -112,8 +113,10 @@ class FusedModel:
         self.mirrored = symmetry is not None
         self.layout = layout = FusedLayout(flat, symmetry)
         self.weights = torch.zeros(layout.size, dtype=dtype, device=device)
-        self.partial = torch.zeros(SPLITS, layout.size, device=device)
-        """Sums over the splits of the samples, (SPLITS, size of the layout)."""
+        self.splits = min(MOST_SPLITS, power_of_two(max(1, rows // SPLIT_ROWS)))
+        """Number of splits of a minibatch."""
+        self.partial = torch.zeros(self.splits, layout.size, device=device)
+        """Sums over the splits of the samples, (splits, size of the layout)."""
         networks = (self.weights, self.partial, rows)
         self.actor = FusedNetwork(layout.actor, flat, *networks, mirrored=self.mirrored)
         self.critic = FusedNetwork(layout.critic, flat, *networks)
@@ -134,7 +137,7 @@ class FusedNetwork:
         self, layers: list[Layer], flat: FlatParameters, weights: torch.Tensor, partial: torch.Tensor, rows: int,
         mirrored: bool = False,
     ) -> None:  # fmt: skip
-        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (SPLITS, size)."""
+        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (splits, size)."""
         self._layers, self._weights, self._value, self._partial = layers, weights, flat.value, partial
         repeats = [2 if mirrored and i > 0 else 1 for i in range(len(layers))]  # rows of a layer for each sample
         self._rows_per_sample = repeats[-1]
@@ -201,8 +204,10 @@ class FusedNetwork:
                     gradients[i], self._weights[layer.weight :], outputs[i - 1], gradients[i - 1], count, layer.inputs,
                     layer.outputs, 128, bn, min(power_of_two(layer.outputs), 64),
                 )  # fmt: skip
-        launch(kernels.weight_gradients, (self._gradient_tiles[-1][1], SPLITS))(
-            gradients, (x, *outputs[:-1]), index, self._partial, self._partial.stride(0), rows, rows_per_split(rows),
+        splits = len(self._partial)
+        launch(kernels.weight_gradients, (self._gradient_tiles[-1][1], splits))(
+            gradients, (x, *outputs[:-1]), index, self._partial, self._partial.stride(0), rows,
+            rows_per_split(rows, splits),
             self._places, self._gradient_tiles, 64,
         )  # fmt: skip
 
@@ -230,9 +235,9 @@ def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]
     return tuple(tiles)
 
 
-def rows_per_split(rows: int) -> int:
-    """Return the number of samples in each of the SPLITS parts (the last ones may have fewer) of a gradient's sum."""
-    return aligned(blocks(rows, SPLITS), WIDTH)
+def rows_per_split(rows: int, splits: int) -> int:
+    """Return the number of samples in each of the splits (the last ones may have fewer) of a gradient's sum."""
+    return aligned(blocks(rows, splits), WIDTH)
 
 
 def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 3) -> Launch:

@@ -11,7 +11,7 @@ from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.flat import FlatAdam
 from jumper_warp.rl.fused import kernels
 from jumper_warp.rl.fused.collector import FusedCollector
-from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, compile_side_by_side, launch, rows_per_split
+from jumper_warp.rl.fused.networks import FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import ActorCritic, Moments
@@ -114,21 +114,22 @@ class FusedUpdate:
         bitwise.
         """
         self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
-        partial, layout, gradient = self._fused.partial, self._fused.layout, self._flat.all_reduced
+        fused, gradient = self._fused, self._flat.all_reduced
         launch(kernels.sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
-            partial, layout.table, gradient, partial.stride(0), len(gradient), SPLITS, self._fused.mirrored, SUM_BLOCK
-        )
+            fused.partial, fused.layout.table, gradient, fused.partial.stride(0), len(gradient), fused.splits,
+            fused.mirrored, SUM_BLOCK,
+        )  # fmt: skip
 
     def _actor_gradient(self, samples: torch.Tensor) -> None:
         """Compute PPO's gradients of actor and noise; write them and the actor's losses as partial sums."""
         fused, rows = self._fused, len(samples)
         partial, layout, log_std = fused.partial, fused.layout, self._model.log_std
         output = fused.actor.forward(self._features, rows, samples)
-        launch(kernels.actor_loss, (SPLITS,), num_warps=8)(
+        launch(kernels.actor_loss, (fused.splits,), num_warps=8)(
             output, fused.mirror, self._samples, self._samples.shape[1], samples, log_std,
             self._collector.rollout.log_std, self._entropy_coef, fused.actor.grad_output, partial[0, layout.noise :],
-            partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows), len(log_std), self._cfg.clip,
-            fused.mirrored, fused.actor.width, LOSS_ROWS,
+            partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits), len(log_std),
+            self._cfg.clip, fused.mirrored, fused.actor.width, LOSS_ROWS,
         )  # fmt: skip
         fused.actor.backward(self._features, rows, samples)
 
@@ -137,9 +138,9 @@ class FusedUpdate:
         fused, cfg, rows = self._fused, self._cfg, len(samples)
         partial, critic = fused.partial, fused.critic
         output = critic.forward(self._critic_features, rows, samples)
-        launch(kernels.critic_loss, (SPLITS,), num_warps=8)(
+        launch(kernels.critic_loss, (fused.splits,), num_warps=8)(
             output, self._samples, self._samples.shape[1], samples, critic.grad_output,
-            partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows),
+            partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits),
             len(self._model.log_std), cfg.clip, cfg.value_coef, cfg.clip_value, critic.width, LOSS_ROWS,
         )  # fmt: skip
         critic.backward(self._critic_features, rows, samples)

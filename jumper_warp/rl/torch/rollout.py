@@ -66,13 +66,16 @@ class Collector:
         """Sum of returns, sum of lengths and number of the finished episodes, (3, num_envs)."""
 
     @torch.no_grad()
-    def roll(self) -> None:
-        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout."""
+    def roll(self, generator: torch.Generator | None = None) -> None:
+        """Run the current policy for `num_steps` policy steps, and record all transitions in the rollout.
+
+        generator: of the exploration noise (default: torch's).
+        """
         env, rollout = self.env, self.rollout
         for scaling, value in zip(self._scaling, self._model.obs_moments.scaling(), strict=True):
             scaling.copy_(value)
         rollout.log_std.copy_(self._model.log_std)
-        rollout.action.normal_()
+        rollout.action.normal_(generator=generator)
         for step in self._steps:
             self._act_step(step)
             env.step(step.action)

@@ -1,0 +1,102 @@
+"""Arguments of another kind raise InputError, and name what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from jumper_warp import Simulation, build_model, load_policy, make_task
+from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.diff.rollout import Rollout
+from jumper_warp.policies.catalog import ONNX, add_files
+from jumper_warp.policies.policy import save_policy
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.assets import POLICIES
+from jumper_warp.utils.errors import InputError
+
+POLICY = POLICIES / "vertical_jump"
+ZEROS = np.zeros(12)
+
+
+@pytest.mark.parametrize("name", [None, 1, [], np.zeros(2), b"vertical-jump"])
+def test_a_task_is_made_from_a_text(name):
+    with pytest.raises(InputError, match="name must be a text"):
+        make_task(name)
+
+
+@pytest.mark.parametrize("device", ["foo", -1, {}, torch.float16])
+def test_a_policy_moves_to_devices_only(device):
+    with pytest.raises(InputError, match="no device"):
+        load_policy("vertical_jump", device)
+
+
+@pytest.mark.parametrize("name", ["motors", "command_filter", "friction", "gravity", "tolerance", "dt"])
+@pytest.mark.parametrize("value", [[1], "x", 0.0 * 1j])
+def test_a_simulation_names_a_setting_of_another_kind(name, value):
+    with pytest.raises(InputError, match=name):
+        Simulation(1, **{name: value})
+
+
+@pytest.mark.parametrize("mask", [slice(None), "x", object(), [1, 0], torch.ones(2)])
+def test_a_mask_of_worlds_is_bool(mask):
+    with pytest.raises(InputError, match="mask must be bool"):
+        Simulation(2).reset(mask)
+
+
+@pytest.mark.parametrize("name", ["motors", "command_filter", "dt", "tolerance"])
+def test_a_rollout_names_a_setting_of_another_kind(name):
+    with pytest.raises(InputError, match=name):
+        Rollout(build_model(1), **{name: [1]})
+
+
+def test_a_rollout_takes_tensors_with_gradient_and_names_other_inputs():
+    rollout = Rollout(build_model(1))
+    q, qd = rollout.standing()
+    expected = rollout.run(ZEROS[None], q, qd).q.numpy()
+    tensor = torch.tensor(q, requires_grad=True)
+    np.testing.assert_array_equal(rollout.run(ZEROS[None], tensor, qd).q.numpy(), expected)
+    for targets in (None, 5, "x"):
+        with pytest.raises(InputError, match="targets"):
+            rollout.run(targets, q, qd)
+    with pytest.raises(InputError, match="geometry"):
+        rollout.set_geometry([["a"] * 10] * 4)
+
+
+def test_masked_values_are_no_numbers():
+    with pytest.raises(InputError, match="masked"):
+        real_array(np.ma.masked_array(ZEROS, mask=ZEROS == 0.0), "values")
+
+
+@pytest.mark.parametrize("observation", [None, "x", np.zeros(3), np.zeros((1, 147)), np.full(147, np.nan)])
+def test_a_deployed_policy_names_an_observation_of_another_kind(observation):
+    with pytest.raises(InputError, match="observation"):
+        DeployedPolicy(POLICY / ONNX).act(observation)
+
+
+@pytest.mark.parametrize("values", [None, "x", np.zeros(3), np.full(12, np.nan), ZEROS + 1j])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_deployed_policy_filters_finite_targets_only(values, place):
+    arguments = [ZEROS, ZEROS, ZEROS]
+    arguments[place] = values
+    with pytest.raises(InputError, match=("target", "angle", "rate")[place]):
+        DeployedPolicy(POLICY / ONNX).filter_targets(*arguments)
+
+
+@pytest.mark.parametrize("values", [(10**400, 4), ("x", 4), (None, 4), (0.0, 1.5), (0.0, "x"), (1j, 4)])
+def test_a_jump_command_takes_a_speed_and_a_number_of_paws(values):
+    with pytest.raises(InputError, match=r"vertical_velocity|paws_down"):
+        JumpCommand().update(*values)
+
+
+@pytest.mark.parametrize("name", ["../outside.txt", "folder/file.txt", "", "..", "a\0b"])
+def test_a_policy_holds_files_of_its_folder_only(name, tmp_path: Path):
+    folder = save_policy(tmp_path / "policy", load_policy("vertical_jump"))
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match="cannot hold"):
+        add_files(folder, {name: b""})
+    with pytest.raises(InputError, match="cannot hold"):
+        save_policy(tmp_path / "other", load_policy("vertical_jump"), files={name: b""})
+    assert sorted(tmp_path.rglob("*")) == before

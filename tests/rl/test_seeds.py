@@ -1,0 +1,187 @@
+"""Several seeds in one process have the results of single trainings; their folders, checkpoints and failures."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from jumper_warp.policies.catalog import newest_run
+from jumper_warp.rl import seeds
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
+from jumper_warp.rl.learner import Learner
+from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.resume import FROZEN, find_checkpoints
+from jumper_warp.rl.run_names import best_score, run_name, seed_folders, title
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
+from jumper_warp.utils.errors import InputError
+from toy_task import PushTask, equal, push_cfg
+
+
+class SeededTask(PushTask):
+    """Task whose start depends on the seed, so that every seed has another training."""
+
+    def __init__(self, num_envs, seed=0, device="cpu"):
+        super().__init__(num_envs, seed, device)
+        self.start *= 1.0 + 0.1 * seed
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    """Settings of 4 iterations of three seeds on 32 worlds each; every second one is logged and saved."""
+    return push_cfg(tmp_path / "logs", seeds=(7, 1, 4))
+
+
+def state(folder, iteration=4):
+    """Return the parts of a seed's checkpoint that a training changes."""
+    saved = load_checkpoint(folder / CHECKPOINTS / f"iteration_{iteration:06d}.pt")
+    return {part: saved[part] for part in ("ppo", "env", "rng")}
+
+
+def test_every_seed_has_bitwise_the_results_of_a_single_training(cfg, tmp_path):
+    result = seeds.train(cfg, SeededTask)
+    folders = seed_folders(result.folder)
+    assert list(folders) == [1, 4, 7] and result.iteration == 4
+    for seed, folder in folders.items():
+        single = train(push_cfg(tmp_path / "single", seed=seed), SeededTask)
+        ours, theirs = state(folder), state(single.folder)
+        theirs["rng"].pop("cpu"), ours["rng"].pop("cpu")  # torch's generator, which this task does not use
+        assert equal(ours, theirs)
+        lines = [json.loads((path / METRICS_FILE).read_text().splitlines()[-1]) for path in (folder, single.folder)]
+        assert [line["Metrics/success"] for line in lines] == [result.seeds[seed].metrics["Metrics/success"]] * 2
+    weights = [state(folder)["ppo"]["model"]["log_std"] for folder in folders.values()]
+    assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
+
+
+def test_resume_continues_all_seeds_bitwise(cfg):
+    whole = seeds.train(cfg, SeededTask)
+    half = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask)
+    again = seeds.train(dataclasses.replace(cfg, resume=str(half.folder)), SeededTask)
+    assert again.folder == half.folder
+    for seed, folder in seed_folders(whole.folder).items():
+        ours, theirs = state(folder), state(again.folder / f"seed_{seed}")
+        assert equal(ours["ppo"], theirs["ppo"]) and equal(ours["env"], theirs["env"])
+        assert torch.equal(ours["rng"]["learner"], theirs["rng"]["learner"])
+
+
+def test_resume_takes_the_last_iteration_that_all_seeds_have(cfg):
+    folder = seeds.train(cfg, SeededTask).folder
+    path = folder / "seed_4" / CHECKPOINTS / MANIFEST
+    manifest = json.loads(path.read_text())
+    del manifest["iteration_000004.pt"]  # as if the process was killed while it saved
+    path.write_text(json.dumps(manifest))
+    found = find_checkpoints(dataclasses.replace(cfg, resume="latest"))
+    assert [checkpoint.state["iteration"] for checkpoint in found] == [2, 2, 2]
+    before = state(folder / "seed_7")
+    seeds.train(dataclasses.replace(cfg, resume="latest"), SeededTask)
+    after = state(folder / "seed_7")
+    assert equal(before["ppo"], after["ppo"])
+
+
+def spoil(monkeypatch, spoiled, at):
+    """Set the weights of some learners, counted by their making, to NaN in their update number `at`."""
+    learners = []
+    update = Learner.update
+
+    def spoiling(self):
+        update(self)
+        if self not in [each for each, _ in learners]:
+            learners.append((self, []))
+        counts = dict((id(each), count) for each, count in learners)[id(self)]
+        counts.append(0)
+        if [id(each) for each, _ in learners].index(id(self)) in spoiled and len(counts) == at:
+            self.flat.value.fill_(float("nan"))
+
+    monkeypatch.setattr(Learner, "update", spoiling)
+
+
+def test_a_seed_that_diverges_is_frozen_and_the_others_continue(cfg, monkeypatch, capsys):
+    spoil(monkeypatch, {1}, at=3)
+    result = seeds.train(cfg, SeededTask)
+    iterations = {seed: each.iteration for seed, each in result.seeds.items()}
+    assert iterations == {7: 4, 1: 4, 4: 4}
+    assert "seed 1: frozen at iteration 4: the weights are not finite" in capsys.readouterr().err
+    assert (result.folder / "seed_1" / FROZEN).read_text().startswith("iteration 4")
+    assert not (result.folder / "seed_1" / CHECKPOINTS / "iteration_000004.pt").exists()
+    longer = dataclasses.replace(cfg, max_iterations=6, resume=str(result.folder))
+    assert {seed: each.iteration for seed, each in seeds.train(longer, SeededTask).seeds.items()} == {7: 6, 4: 6}
+
+
+def test_training_fails_if_all_seeds_diverge(cfg, monkeypatch):
+    spoil(monkeypatch, {0, 1, 2}, at=1)
+    with pytest.raises(SystemExit, match="weights are not finite"):
+        seeds.train(cfg, SeededTask)
+
+
+def test_a_single_training_ends_if_it_diverges(cfg, monkeypatch):
+    spoil(monkeypatch, {0}, at=3)
+    with pytest.raises(SystemExit, match="weights are not finite"):
+        train(dataclasses.replace(cfg, seeds=()), SeededTask)
+
+
+def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
+    result = seeds.train(cfg, SeededTask)
+    folders = seed_folders(result.folder)
+    for seed, folder in folders.items():
+        assert newest_run(f"{result.folder}:{seed}") == folder
+        assert newest_run(f"{cfg.log_root / 'push'}:{seed}") == folder
+        assert newest_run(folder) == folder
+    scores = [0.3, 0.9, 0.5]
+    for folder, score in zip(folders.values(), scores, strict=True):
+        path = folder / CHECKPOINTS / MANIFEST
+        manifest = json.loads(path.read_text())
+        path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
+    assert [best_score(folder) for folder in folders.values()] == scores
+    assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[7]
+    with pytest.raises(InputError, match="no checkpoint of seed 3; seeds with checkpoints: 1, 4, 7"):
+        newest_run(f"{result.folder}:3")
+
+
+def test_progress_shows_mean_and_interval_over_seeds(cfg, capsys):
+    seeds.train(dataclasses.replace(cfg, run_name="first try"), SeededTask)
+    err = capsys.readouterr().err.splitlines()
+    assert sum(line.startswith("iteration ") for line in err) == 2  # not one a seed
+    line = next(line for line in err if line.startswith("iteration 4/4, 0.01 M steps: "))
+    assert " reward " in line and " success " in line and line.count("[") == 2
+    assert sum(line.startswith(("1 ", "4 ", "7 ")) for line in err) == 3  # the table at the end
+
+
+def test_name_of_a_run_is_in_its_folder_and_its_title(cfg):
+    result = seeds.train(dataclasses.replace(cfg, run_name="first try", max_iterations=2), SeededTask)
+    assert result.folder.name.endswith("_first-try")
+    assert title(result.folder) == "first-try" and title(result.folder / "seed_4") == "first-try:4"
+    assert title(result.folder.with_name(run_name(0))) == run_name(0)
+    settings = json.loads((result.folder / "seed_4" / CONFIG).read_text())["train"]
+    assert (settings["seed"], settings["seeds"], settings["run_name"]) == (4, [], "first try")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": (1, 1)}, "seeds must be distinct"),
+        ({"seeds": (1, -1)}, "seed must be in"),
+        ({"seeds": (1,), "trainer": "rsl-rl"}, "seeds are not supported"),
+        ({"run_name": "a/b"}, "run_name and tags"),
+        ({"tags": ("",)}, "run_name and tags"),
+    ],
+)
+def test_settings_of_seeds_and_names_are_checked(changes, message):
+    with pytest.raises(InputError, match=message):
+        TrainCfg(**changes)
+
+
+def test_resume_refuses_other_seeds(cfg):
+    folder = str(seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder)
+    with pytest.raises(InputError, match="has seeds 1, 4, 7, got seeds 1, 2"):
+        seeds.train(dataclasses.replace(cfg, seeds=(1, 2), resume=folder), SeededTask)
+    single = train(dataclasses.replace(cfg, seeds=(), max_iterations=2), SeededTask).folder
+    with pytest.raises(InputError, match="has one seed"):
+        seeds.train(dataclasses.replace(cfg, resume=str(single)), SeededTask)
+
+
+def test_resume_of_a_run_without_common_checkpoint_is_refused(cfg):
+    folder = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder
+    (folder / "seed_1" / CHECKPOINTS / "iteration_000002.pt").unlink()
+    with pytest.raises(CheckpointError, match="no usable checkpoint of the same iteration"):
+        find_checkpoints(dataclasses.replace(cfg, resume=str(folder)))
