@@ -1,8 +1,8 @@
 """Mass properties: zeroth, first and second moments of a mass distribution.
 
 Packed second moments are S = integral of r r^T dm [kg m^2] about a stated point, as (xx, yy, zz, xy, xz, yz). Moments
-of several links about one point add up; the inertia tensor is trace(S) 1 - S. S turns
-with its links as r r^T does, which makes its rotations and derivatives short.
+of several links about one point add up; the inertia tensor is trace(S) 1 - S. S turns with its
+links as r r^T does, which makes its rotations and derivatives short.
 
 Angles of rotation are given as cosine c and sine s, which the kinematics have already; -s inverts a rotation. Vectors
 and derivatives in the plane of a leg (xz) are stored without their y, which is 0.

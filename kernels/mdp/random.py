@@ -64,8 +64,8 @@ def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: in
 def fold_in(rng: RngStream, i: int) -> RngStream:
     """Return a new random stream that is derived from another and an index, independent for every i.
 
-    Attempts at a start state, for example, use the same indices in streams of their own. 7919 keeps
-    their seeds apart from the states of the stream's own numbers.
+    Attempts at a start state, for example, use the same indices in streams of their own. 7919 keeps their
+    seeds apart from the states of the stream's own numbers.
     """
     branch = rng
     branch.seed = wp.rand_init(int(rng.seed), 7919 + i)

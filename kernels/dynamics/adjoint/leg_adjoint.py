@@ -4,10 +4,10 @@
 2. `reverse_leg` goes backwards from step to step and records multipliers.
 3. `add_leg_constants` adds the gradients w.r.t. parameters, computed from these, many steps in parallel.
 
-Only the second part is sequential. A cotangent is the gradient of the loss w.r.t. a
-result of the step; multipliers ("weights") are the solution of the step's transposed equations, see `step_adjoint`.
-`sum_*` add values of a world's four threads, `*_from_leg` read the value of another thread. An entry of the record is
-a physics step. Vectors of motors are lateral, outer, inner.
+Only the second part is sequential. A cotangent is the gradient of the loss w.r.t. a result of the step; multipliers
+("weights") are the solution of the step's transposed equations, see `step_adjoint`. `sum_*` add values of a world's
+four threads, `*_from_leg` read the value of another thread. An entry of the record is a physics step. Vectors of motors
+are lateral, outer, inner.
 """
 
 import warp as wp
