@@ -42,6 +42,7 @@ class Args(EvaluationArgs, AttitudeFlags):
     """Number of turns to record for the Rerun viewer and, one of them, as a picture; 0: none."""
 
     def __post_init__(self) -> None:
+        """Raise InputError as `EvaluationArgs` and `AttitudeFlags`."""
         super().__post_init__()
         AttitudeFlags.__post_init__(self)
 

@@ -320,6 +320,7 @@ class Args(ThreadArgs):
     measure: bool = True  # Make the jumps after each training
 
     def __post_init__(self) -> None:
+        """Raise InputError for a departure that the task does not have."""
         unknown = set(self.only) - {BASELINE, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")

@@ -75,7 +75,8 @@ def random_states(n: int, seed: int) -> States:
 def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     """Compute accelerations, paw positions and Jacobians in given states by this project's dynamics.
 
-    The robot is the first one of `values`. Keys: those of UNITS.
+    The dynamics only advance states: accelerations are changes of velocity over one tiny step, DT. The robot is the
+    first one of `values`. Keys: those of UNITS.
     """
     n = len(states["angles"])
     model = build_model(n, ground=None, visuals=False, device="cpu", robot=values)
@@ -94,7 +95,10 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
         return wp.array(rows.ravel(), dtype=wp.float64, device="cpu")
 
     def base_velocity(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
-        """Return orientation, velocity of the base origin [m/s] (world) and angular velocity [rad/s] (body axes)."""
+        """Return orientation, velocity of the base origin [m/s] (world) and angular velocity [rad/s] (body axes).
+
+        The first three of Newton's rates `qd` are the velocity of the base's centre of mass, in the world.
+        """
         turn = Rotation.from_quat(q[:, 3:7])
         origin = qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(values.base_com[0].astype(np.float32)))
         return turn, origin, turn.inv().apply(qd[:, 3:6])
@@ -116,6 +120,7 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
 def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     """Compute the paws' positions and Jacobians by this project's dynamics, with the base unrotated at the origin.
 
+    A column of a Jacobian is the velocity of a paw if one motor of its leg turns at 1 rad/s and all others rest.
     Keys: `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad].
     q: joint coordinates (n, 43), whose base orientation is overwritten.
     """
@@ -144,7 +149,8 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
 def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
     """Compute accelerations, paw positions and Jacobians in given states by Pinocchio.
 
-    The robot is the first one of `values`. Keys: those of UNITS.
+    Its base velocity v is that of the body's origin, in body axes; with the spin w, the origin's acceleration in these
+    axes is dv/dt + w x v. The robot is the first one of `values`. Keys: those of UNITS.
     """
     robot = build_pinocchio(values=values)
     rows = []

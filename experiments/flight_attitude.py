@@ -64,6 +64,7 @@ class FlightLog(EvaluationLog):
     spacing = 1.6
 
     def __post_init__(self) -> None:
+        """Allocate results of one flight per world, NaN or -1 until they are known."""
         n = self.count = len(self.apex)
         self.step_dt = 1.0 / 60.0  # [s] policy step; `begin` sets that of the environment
         self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way
@@ -93,7 +94,8 @@ class FlightLog(EvaluationLog):
     def open_loop(self, late: np.ndarray) -> np.ndarray:
         """Return the transversal motor angles [deg] of the open-loop takeoff at the next policy step.
 
-        The result is (num_envs, 4), legs FL, FR, BL, BR.
+        A leg that extends a fraction of a policy step late gets the same fraction less of its extension in that step.
+        The default pose has 45 degrees. The result is (num_envs, 4), legs FL, FR, BL, BR.
         late: the field `late`.
         """
         step = len(self.tilts)
@@ -151,7 +153,8 @@ class FlightLog(EvaluationLog):
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Record a policy step from the arrays of `read_env`; return whether all flights have ended.
 
-        A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension.
+        A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension. A
+        takeoff is a step in which the robot rises without contact: paws of a robot that falls over lose contact too.
         """
         step = len(self.tilts)
         running = self.end < 0
@@ -298,11 +301,12 @@ class FlightRun(Run):
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return a function that returns the actions of jump and turning skill, (2, num_envs, 12).
 
-        Its argument is ignored.
+        Its argument is ignored: each policy gets the observations of its own skill.
         """
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:
+            """Return the actions of jump (policy or fixed takeoff) and turn, (2, num_envs, 12)."""
             jump = None if self.landing is None else self.landing.act(env.skills[JUMP].obs["actor"])
             action = torch.as_tensor(self.flights.action(scale, jump), dtype=torch.float32, device=env.device)
             return torch.stack([action, self.turn.act(env.skills[TURN].obs["actor"])])
@@ -352,6 +356,7 @@ class Args(EvaluationArgs):
     """[m] Lowest and highest base height commanded to the policy that lands."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a takeoff by a policy without a policy."""
         super().__post_init__()
         if self.takeoff == "policy" and not self.landing_policy:
             raise InputError("takeoff by a policy needs one: --landing-policy")

@@ -92,7 +92,8 @@ def build(args: Args, device: torch.device, still: bool = False, **changes: obje
 def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
     """Return the relative errors of a minibatch's gradient, by parameter and of the losses, against float64 autograd.
 
-    The weights differ from those that acted. Raises RuntimeError: the gradient does not repeat bitwise.
+    The weights differ from those that acted: with equal ones all probability ratios would be 1, and none clipped.
+    Raises RuntimeError: the gradient does not repeat bitwise.
     """
     cfg, flat = ppo.cfg, ppo.flat
     with torch.no_grad():
@@ -144,7 +145,10 @@ def repeats(args: Args, device: torch.device) -> bool:
 
 
 def times(ppo: Learner, args: Args) -> dict[str, float]:
-    """Return the times [us] of an acting step and an update, on a GPU as CUDA graphs."""
+    """Return the times [us] of collecting a rollout, of an update and of an acting step, on a GPU as CUDA graphs.
+
+    ppo: on a still `RandomEnv`, whose steps cost nothing.
+    """
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     collect, update = (1.0e6 * median_time(part, args.device, args.calls) for part in (ppo.collect, ppo.update))

@@ -33,7 +33,10 @@ class Ascent:
 
 
 def ascend(device: str | None) -> Ascent:
-    """Raise the apex of a jump with a weak push-off by ASCENT_STEPS normalised gradient steps on all motor targets."""
+    """Raise the apex of a jump with a weak push-off by ASCENT_STEPS normalised gradient steps on all motor targets.
+
+    In each step the target with the largest derivative changes by ASCENT_CHANGE, whatever the size of the gradient.
+    """
     jump = GradientJump(1, double=False, device=device)
     targets = schedule(WEAK_PUSH)
     heights = []

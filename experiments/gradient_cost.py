@@ -82,7 +82,10 @@ class PlainJump:
 
 
 class GradientRun:
-    """Jump as a differentiable rollout, with the gradient of its final height by the reverse pass."""
+    """Jump as a differentiable rollout, with the gradient of its final base height by the reverse pass.
+
+    The reverse pass begins with the derivative of this height w.r.t. the trajectory: 1 for z in the last row, else 0.
+    """
 
     def __init__(self, worlds: int, double: bool, device: str | None):
         """Build the rollout and its inputs for a number of worlds; double: compute in double precision."""

@@ -52,7 +52,11 @@ DRAWS = 10_000  # Number of sampled errors of an estimate
 
 
 def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
-    """Sample normalised parameters (P,) of a robot with masses, gains, friction and latency far from nominal."""
+    """Sample normalised parameters (P,) of a robot with masses, gains, friction and latency far from nominal.
+
+    The description has 0, and the unit is the standard deviation of a parameter's prior. All parameters of a quantity
+    in FAR, such as the masses of the links, are off by one common distance, around which they scatter.
+    """
     z = OWN * rng.normal(size=len(parameters))
     for quantity in FAR:
         members = [i for i, parameter in enumerate(parameters) if parameter.quantity == quantity]

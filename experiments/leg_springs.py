@@ -58,6 +58,7 @@ class SpringJumps:
     def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
         """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).
 
+        All are parallel worlds of one simulation. The legs stay extended in flight, since only the apex counts.
         stiffness [N/m]: of the springs; squats [deg]: commanded transversal angles of the squat.
         """
         shape = (len(stiffness), len(squats))

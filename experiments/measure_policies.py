@@ -51,7 +51,10 @@ from support.scripts import ThreadArgs, announce, run_script, tracked
 
 
 def with_trials(flags: Any, trials: int) -> Any:
-    """Return a copy of the flags of `jumper evaluate` with at least this number of trials."""
+    """Return a copy of the flags of `jumper evaluate` with at least this number of trials.
+
+    A test of velocities has n^3 combinations of commands, each at once and slewed, and STANDING robots that stand.
+    """
     if isinstance(flags, JumpFlags):
         return replace(flags, num_jumps=trials)
     if isinstance(flags, AttitudeFlags):
@@ -77,7 +80,7 @@ def payload_overlay(overlay: RobotOverlay | None, mass: float) -> RobotOverlay:
     """Return a robot overlay with a point mass [kg] added at the origin of the base's frame.
 
     overlay: robot without payload, None: the described one. The inertia about the centre of mass stays: the part that
-    the payload adds there is below 1 %.
+    the payload adds there is below 1 %. Since it scales with `base_mass`, the factor `base_inertia` falls.
     """
     overlay = overlay or RobotOverlay({})
     robot = overlay.robots()

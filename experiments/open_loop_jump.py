@@ -48,17 +48,24 @@ class Args(DeviceArgs):
     robot: Path | None = None  # Robot overlay, as `jumper sysid` writes it, in place of springs
 
     def __post_init__(self) -> None:
+        """Raise InputError if springs are given twice: by flags, and by a robot overlay."""
         if self.spring is not None and self.robot is not None:
             raise InputError("give springs or a robot, which may have springs")
 
 
 def factor_of(robot: RobotOverlay | None, name: str) -> float:
-    """Return the smallest factor [1] by which an overlay scales `name` of the transversal motors; 1 without overlay."""
+    """Return the smallest factor [1] by which an overlay scales `name` of the transversal motors; 1 without overlay.
+
+    The titles state the value of the weakest motor.
+    """
     return 1.0 if robot is None else float(getattr(robot.robots(), name)[0, list(TRANSVERSAL)].min())
 
 
 def measure(args: Args, folder: Path) -> tuple[Json, str]:
-    """Simulate the open-loop jump, write its plots and recording into a folder, return metrics and a title."""
+    """Simulate the open-loop jump, write its plots and recording into a folder, return metrics and a title.
+
+    The apex of the paper's robot is one of the metrics only if motors, gravity, filter and robot are the paper's.
+    """
     robot = None if args.robot is None else load_overlay(args.robot)
     limit, kp = (value * factor_of(robot, name) for name, value in (("saturation", args.torque_limit), ("kp", args.kp)))
     variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": limit, "kp_nm_rad": kp,

@@ -70,6 +70,7 @@ def arm_flags(task: TaskCfg, arm: str) -> list[str]:
     flags: list[str] = []
 
     def add(name: str, *values: float) -> None:
+        """Add a flag of `jumper train` with its values."""
         flags.extend([f"--env.{name.replace('_', '-')}", *(f"{value:g}" for value in values)])
 
     if arm == "no_initialisation":

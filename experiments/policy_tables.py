@@ -63,7 +63,10 @@ def kind_of(task: TaskCfg) -> str:
 
 
 def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
-    """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
+    """Return the range of commands that a task samples in training, as text; values: conditions of a row.
+
+    They are jumps [m], velocities ahead / back, aside and about z, or else turns [deg].
+    """
     if pair := values.get("trained_range_m"):
         levels: Any = task.levels
         aside = max(level.goal_upper[1] for level in levels)

@@ -118,6 +118,7 @@ class MotionReplay:
     def _physics_step(self, number: int) -> tuple:
         """Advance by a physics step, and return the measurements after it, a row of the measured arrays.
 
+        Power is the torque in the step times the mean of the motor rates before and after it.
         number: of physics steps before it.
         """
         sim = self.sim
@@ -163,7 +164,10 @@ class MotionReplay:
         self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], forces)
 
     def _evaluate(self) -> None:
-        """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""
+        """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown.
+
+        A lift begins and ends where the difference of "off the ground" between two physics steps is not 0.
+        """
         down = self.force > CONTACT_FORCE
         ticks = slice(self.sim.substeps - 1, None, self.sim.substeps)
         free = ~down[ticks].any(axis=1) & (self.up[ticks] > TAKEOFF_SPEED)
@@ -348,8 +352,9 @@ def _far(
 ) -> Problem:
     """Return the optimisation problem of the farthest flight.
 
-    lean [1]: weight of leaning back before it, up to BACK; torque [N m] and speed [1]: as for `motors_of`; pitch [rad],
-    away [m]: limits PITCH, AWAY; settings: further arguments of `Problem`.
+    lean [1]: weight of leaning back before it, up to BACK, which gives the base a longer way to accelerate ahead;
+    torque [N m] and speed [1]: as for `motors_of`; pitch [rad], away [m]: limits PITCH, AWAY; settings: further
+    arguments of `Problem`.
     """
     constraints = (
         jumps.landing_pitch(pitch), jumps.stays(away, TAKEOFF_SPEED), jumps.clear(speed=TAKEOFF_SPEED),

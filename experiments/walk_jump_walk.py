@@ -51,6 +51,7 @@ class Args(EvaluationArgs):
     blocks: bool = True  # Whether courses have blocks to jump onto; SolverMuJoCo has none
 
     def __post_init__(self) -> None:
+        """Raise InputError for a number of robots out of range."""
         super().__post_init__()
         if not 1 <= self.num_robots <= 20_000:
             raise InputError(f"num_robots must be in 1 to 20000, got {self.num_robots}")

@@ -41,6 +41,7 @@ class Args(EvaluationArgs):
     num_recorded: int = 1  # Number of robots to record on each terrain for the Rerun viewer; 0: none
 
     def __post_init__(self) -> None:
+        """Raise InputError for a speed [m/s] at which the walk would leave its tile."""
         super().__post_init__()
         check_velocity_settings(self.num_robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:

@@ -136,7 +136,10 @@ def gait_metrics(
 
 
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Return the largest height [m] in each complete swing of one paw, (swings,); contact, height [m]: (steps,)."""
+    """Return the largest height [m] in each complete swing of one paw, (swings,); contact, height [m]: (steps,).
+
+    A swing is complete from a lift to the next touchdown; one that the log cuts off is ignored.
+    """
     edges = np.diff(contact.astype(int))
     lifts = np.flatnonzero(edges == -1) + 1
     lands = np.flatnonzero(edges == 1) + 1
@@ -164,6 +167,7 @@ def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
 def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
     """Return an empty log for walks whose commanded velocity rises along one of DIRECTIONS, and these directions.
 
+    It rises in seven equal steps within RAMP to 0.3 up to the highest command, another one for each robot.
     The directions are each robot's index in DIRECTIONS, (robots,).
     """
     direction = np.arange(env.num_envs) % len(DIRECTIONS)

@@ -80,7 +80,10 @@ class Recipe:
         return {"train": json.loads(json.dumps(dataclasses.asdict(self.train), default=str)), "env": env}
 
     def check_saving(self) -> None:
-        """Raise InputError unless the task, saved as JSON and read back, is unchanged."""
+        """Raise InputError unless the task, saved as JSON and read back, is unchanged.
+
+        It is called before a training, whose checkpoints would otherwise stand for another task.
+        """
         task = self.task
         if task_from_json(json.loads(json.dumps(task_to_json(task))), _imported()) != task:
             raise TaskError(f"{task.name} differs from the original after it is saved as JSON and loaded")
@@ -110,7 +113,11 @@ def _imported() -> list[ModuleType]:
 
 
 def _restored(saved: Any, modules: list[ModuleType], complete: bool) -> tuple[TaskCfg, str]:
-    """Return the task in JSON data, and the reason why it lacks its events; arguments: see `Recipe.from_json`."""
+    """Return the task in JSON data, and the reason why it lacks its events; arguments: see `Recipe.from_json`.
+
+    Functions of a user's task may be missing. Unless it must be `complete`, rewards and critic may be left out, which a
+    trained policy does not need, and then all sections in OPTIONAL.
+    """
     try:
         return task_from_json(saved, modules), ""
     except TaskError:

@@ -200,7 +200,7 @@ def register_task(
 
 
 def _is_same_function(make: Any, other: Any) -> bool:
-    """Return whether two factory functions have the same module and name."""
+    """Return whether two factory functions have the same module and name, as after a notebook's cell runs again."""
     names = [(getattr(f, "__module__", None), getattr(f, "__qualname__", None)) for f in (make, other)]
     return names[0] == names[1] and None not in names[0]
 
@@ -331,6 +331,9 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _is_elsewhere(name: str, path: Path) -> bool:
-    """Return whether `import name` would import a file other than `path`."""
+    """Return whether `import name` would import a file other than `path`.
+
+    Then a saved task, which names its functions as `module:function`, would find the wrong ones.
+    """
     spec = importlib.util.find_spec(name)
     return spec is not None and spec.origin != str(path)

@@ -3,6 +3,9 @@
 A world has four threads (one per leg: FL, FR, BL, BR), or 32 (eight attempts of four); the leg index runs fastest. All
 threads of a warp must execute every call together: place none behind `and` or `or`, or in a branch that some threads
 skip. On the CPU, which only tests use, a block holds the threads of one world (`block_dim=4`, or 32).
+
+Exchange through registers (shuffles and votes) is faster than through memory, and needs no barrier. `_exchange` builds
+C++ snippets, which have no Python body.
 """
 
 import warp as wp
@@ -132,7 +135,10 @@ def from_leg_of_attempt(x: float, leg: int) -> float:
 
 @wp.func_native(_ANY)
 def any_world(flag: bool) -> bool:
-    """Return whether the flag is set in any world of the warp; all threads of a world must pass the same flag."""
+    """Return whether the flag is set in any world of the warp; all threads of a world must pass the same flag.
+
+    Worlds of a warp leave a loop together, since its exchanges need all threads.
+    """
     ...
 
 

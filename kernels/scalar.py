@@ -2,7 +2,8 @@
 
 Every function of the robot's physics is written in terms of `real`. The package is single precision;
 `jumper_warp.sim.precision.float64_kernels()` loads the same files a second time under the name
-`jumper_warp.kernels_float64`, where `real` is double precision: the reference for rounding and for gradients.
+`jumper_warp.kernels_float64`, where `real` is double precision: the reference for rounding and for gradients. Numbers
+in kernels are written `real(0.5)`, as Warp converts no types implicitly.
 """
 
 import warp as wp

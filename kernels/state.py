@@ -1,8 +1,10 @@
 """Reading and writing the robot's 18 coordinates in Newton's state arrays.
 
 Per world `joint_q` holds 43 coordinates: base position, base quaternion (xyzw), five angles a leg (lateral, outer,
-outer knee, inner, inner knee), and four loop-joint quaternions. `joint_qd` holds 38 rates in the same order. The
-base's rates are the velocity of its centre of mass and its angular velocity, both in the world frame.
+outer knee, inner, inner knee), and four loop-joint quaternions. `joint_qd` holds 38 rates in the same order. The base's
+rates are the velocity of its centre of mass and its angular velocity, both in the world frame. The physics kernels use
+the velocity of the base's origin and body axes instead, in which a leg's terms do not depend on the pose. The closed
+loops leave 18 of the coordinates free: 6 of the base and 12 of the motors; `full_state` completes the others.
 """
 
 import warp as wp

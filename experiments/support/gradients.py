@@ -81,7 +81,8 @@ class GradientJump:
     def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
         """Simulate a jump in one world; return it and the gradients of its apex with respect to all inputs.
 
-        A gradient has the shape of its input; `mass` (21,) is added.
+        The gradient of the largest height is that of the height in its row. It has the shape of its input; `mass` (21,)
+        is added.
         inputs: as for `run`; mass: of each body [m/kg].
         """
         jump = self.run(inputs)
@@ -129,7 +130,7 @@ def unit_directions(shape: tuple[int, ...], indices: list) -> np.ndarray:
 def mass_directions(table: np.ndarray) -> np.ndarray:
     """Return the change of the parameter table (rows,) by 1 kg more of each body, (bodies, rows).
 
-    The COM and the inertia about it are constant.
+    The COM c and the inertia about it are constant: the table's moments about the origin gain 1, c and c c^T.
     """
     directions = np.zeros((int(BODIES), len(table)))
     for body, direction in enumerate(directions):
@@ -143,7 +144,8 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
     """Compute the gradients of a jump's apex by the reverse pass and by central differences.
 
     Returns the jump, and pairs (gradient, differences) by kind of input.
-    Kinds: actions (targets of OUTER and INNER), mass, torque_limit, friction (on the slippery ground), initial_state.
+    Kinds: actions (targets of OUTER and INNER), mass, torque_limit, friction (on the slippery ground, since it has no
+    effect on a paw that sticks), initial_state.
     """
     jump = GradientJump(1, double=True, device=device)
     trajectory, grads = jump.gradients({})

@@ -163,6 +163,7 @@ def curve_metrics(curve: LearningCurve, name: str) -> Json:
 def compare(first: Sequence[LearningCurve], second: Sequence[LearningCurve], rate: float = 0.95) -> dict[str, float]:
     """Return p-values of the hypotheses that two trainers are equally fast and successful, with Holm's correction.
 
+    The correction for two tests doubles the smaller p-value; the larger one is at least as large as this.
     Two-sided rank tests (Mann-Whitney) of the steps to a success rate, infinite if it is not reached, and of the final
     success. Keys: `p_steps_to_95_percent`, `p_final_success`.
     """

@@ -31,6 +31,7 @@ def largest_forces(forces: np.ndarray) -> np.ndarray:
 def transversal_command(tick: int, squat: float = SQUAT) -> float:
     """Return the angle [rad] that the open-loop jump commands to the transversal motors at a policy step.
 
+    The default pose has 45 degrees; -45 degrees extend the legs.
     tick: the policy step; squat [deg]: commanded angle of the squat.
     """
     degrees = 45.0 + (squat - 45.0) * np.clip((tick - STAND) / RAMP, 0.0, 1.0)
@@ -108,7 +109,7 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple, force: np.ndarray)
 def trace_metrics(trace: Trace) -> dict[str, float]:
     """Return the metrics of the open-loop jump, with units at the end of the names.
 
-    Times count from the extension's command.
+    Takeoff is the last contact before the apex. Times count from the extension's command.
     """
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
     extend_s = (STAND + RAMP + HOLD) / 60.0  # [s] command of the extension

@@ -109,6 +109,7 @@ def tasks_of(policies: Iterable[str]) -> dict[str, TaskCfg]:
 def save_to_policies(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> None:
     """Write measured results into the saved metrics of policies, and update the policies' manifests.
 
+    Each row is one line of the file.
     Saved rows of other conditions and seeds, and metrics of earlier definitions, are kept.
     """
     for policy in dict.fromkeys(row.policy for row in rows):

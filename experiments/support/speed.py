@@ -115,6 +115,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     check_standing(sim, 0.40)
 
     def advance(worlds: WorldRange) -> None:
+        """Advance a range of worlds by one policy step at constant targets; one CPU thread runs it."""
         sim.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
     graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # the graph does not keep its arrays alive
@@ -122,12 +123,16 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
 
 
 def stepping_env(envs: int, device: str | None, threads: int | None = None) -> tuple[Env, Callable[[], None]]:
-    """Return an environment in the middle of its episodes, and a function that steps it with random actions."""
+    """Return an environment in the middle of its episodes, and a function that steps it with random actions.
+
+    The actions are drawn before, so that drawing them is not timed. Raises RuntimeError: too many episodes diverge.
+    """
     env = Env(make_task("vertical-jump"), envs, device=device, threads=threads)
     actions = torch.rand(16, envs, env.num_actions, device=env.device) * 2.0 - 1.0
     count = 0
 
     def step() -> None:
+        """Run one policy step with the next of the random actions."""
         nonlocal count
         env.step(actions[count % len(actions)])
         count += 1
@@ -144,7 +149,8 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
 def time_policy(envs: int, repeats: int, device: str | None, solver: SolverName = "jumper") -> float:
     """Time an environment whose robots jump: return the median wall time per policy step [s].
 
-    The actions of the project's policy `vertical_jump` are recorded, and repeated from the same state.
+    The actions of the project's policy `vertical_jump` are recorded, and repeated from the same state, so that its
+    network is not timed.
     Raises RuntimeError: fewer than half of the robots reach 0.5 m.
     """
     env = Env(make_task("vertical-jump"), envs, device=device, solver=solver)
@@ -240,6 +246,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     stopwatch = Stopwatch(env.device)
 
     def iterate() -> None:
+        """Run one PPO iteration, and stop the time of each of its parts."""
         stopwatch.start()
         ppo.iterate(mark=stopwatch.mark)
 

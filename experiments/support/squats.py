@@ -24,6 +24,7 @@ class SquatLog(EvaluationLog):
     row_name = "squat"
 
     def __post_init__(self) -> None:
+        """Prepare empty lists, which get an array per policy step."""
         self.count = len(self.goals)
         self.step_dt = 1.0 / 60.0
         self.ended = np.zeros(self.count, dtype=bool)  # (num_envs,) whether each episode has ended
@@ -71,7 +72,8 @@ class SquatLog(EvaluationLog):
     def force_range(self) -> np.ndarray:
         """Largest minus smallest force on a paw within the window [N], maximum over the paws.
 
-        One value for each robot that has not ended.
+        The largest is over all physics steps, the smallest over the ends of policy steps, as the simulation only keeps
+        peaks in between. One value for each robot that has not ended.
         """
         return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
 

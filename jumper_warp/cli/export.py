@@ -28,7 +28,10 @@ class ExportCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper export` or `jumper export robot`; raises as `export` or `export_robot`. modules: unused."""
+    """Run `jumper export` or `jumper export robot`; raises as `export` or `export_robot`.
+
+    modules: unused; all commands take it.
+    """
     if args[:1] == ["robot"]:
         from jumper_warp.cli import export_robot
 

@@ -131,6 +131,7 @@ def print_help(
 ) -> None:
     """Print the help page that `--help`, `--help GROUP` or `--help-all` among the arguments requests; exits with 0.
 
+    A task has hundreds of flags: tyro prints a dataclass that is made of only the requested ones.
     program: command line without flags. about: what it does. short: names of the flags of --help (default: all), each
     with the first sentence of its description. Raises InputError: there is no such group.
     """
@@ -153,7 +154,10 @@ def print_help(
 
 
 def help_field(flag: Flag) -> tuple[str, Any, Any]:
-    """Return a field of a dataclass, as for `dataclasses.make_dataclass`, whose help in tyro describes a flag."""
+    """Return a field of a dataclass, as for `dataclasses.make_dataclass`, whose help in tyro describes a flag.
+
+    tyro appends the default to the text, unless the default is empty or the text states it.
+    """
     hint = "" if flag.default in (None, dataclasses.MISSING) or "(default" in flag.about else None
     metavar = flag.name if flag.positional else None
     settings = tyro.conf.arg(name=flag.name, metavar=metavar, help=flag.about, help_behavior_hint=hint)
@@ -164,6 +168,7 @@ def help_field(flag: Flag) -> tuple[str, Any, Any]:
 def check_numbers(settings: Any) -> None:
     """Raise InputError for a number in parsed flags that is too large or not finite.
 
+    Otherwise such a number would fail later, as an overflow or exhausted memory without the name of its flag.
     settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others, none for durations of a task.
     """
     for flag in list_flags(settings, described=False):

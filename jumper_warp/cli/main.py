@@ -113,7 +113,10 @@ def check_not_empty(args: Sequence[str]) -> None:
 
 
 def user_file_error(folders: Collection[str], error: Exception) -> str | None:
-    """Return a message with file and line of an exception raised in a file of `folders` (absolute paths), else None."""
+    """Return a message with file and line of an exception raised in a file of `folders` (absolute paths), else None.
+
+    A mistake in the user's own file is invalid input, which one line explains; the project's faults keep the traceback.
+    """
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     if isinstance(error, InputError) or not frames or os.path.dirname(os.path.abspath(frames[-1][0])) not in folders:
         return None

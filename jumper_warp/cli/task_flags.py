@@ -67,7 +67,10 @@ def _flag(value: Any, hint: Any, where: str) -> Setting | None:
 
 
 def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
-    """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
+    """Return the flags of a dataclass's fields; fields that hold functions or names have none.
+
+    Its docstring and those of its fields become the help. where: path of the dataclass, for messages.
+    """
     hints = get_type_hints(type(value))
     docs = field_docs(type(value))
     flags = {}
@@ -122,7 +125,10 @@ def with_flags(value: Any, flags: Any) -> Any:
 
 
 def _parts(value: Any) -> Json:
-    """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
+    """Return the named parts of a term, dataclass or tuple of either, by name or index; empty for any other value.
+
+    Both directions, `flags_of` and `with_flags`, walk through a task by these names.
+    """
     if isinstance(value, Term):
         return {**value.numbers, **value.options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -133,7 +139,10 @@ def _parts(value: Any) -> Json:
 
 
 def _is_number(value: Any, hint: Any) -> bool:
-    """Return whether a setting can have a flag: it holds numbers or a choice, or is optional; no function or name."""
+    """Return whether a setting can have a flag: it holds numbers or a choice, or is optional; no function or name.
+
+    hint: annotation of the field, which distinguishes a choice (Literal) from a name, and what may replace None.
+    """
     if isinstance(value, str):
         return hint is not str
     if isinstance(value, tuple):

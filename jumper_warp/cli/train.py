@@ -100,8 +100,9 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
 def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     """Return the recipe and the checkpoints, one of each seed, of the run that --resume selects in unparsed arguments.
 
-    Without the flag, and for a new run, the given recipe and no checkpoint. Raises CheckpointError: the run is of
-    another task, or cannot be used.
+    The saved recipe gives the defaults of all other flags, so that they are parsed after it is found. Without the flag,
+    and for a new run, the given recipe and no checkpoint. Raises CheckpointError: the run is of another task, or cannot
+    be used.
     """
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}
@@ -166,6 +167,7 @@ def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
 def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
     """Return the settings parsed from `args`, with the recipe's as defaults, and the task changed by its --env flags.
 
+    tyro needs one dataclass of all flags: `TrainArgs`, here extended by a field with those of the task.
     Exits with 0 after help. Raises InputError: a setting is out of range.
     """
     from jumper_warp.cli.task_flags import flags_of, with_flags
@@ -194,7 +196,10 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
 
 
 def flagged_ranges(args: Sequence[str]) -> set[str]:
-    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments."""
+    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments.
+
+    Such a flag overrides the range in a robot overlay, even if its value is the default.
+    """
     from jumper_warp.robot.overlay import RANDOMIZED
 
     options = {option_of(arg) for arg in args}

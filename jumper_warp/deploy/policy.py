@@ -235,6 +235,7 @@ def limit_command(
 ) -> np.ndarray:
     """Return commands [rad] from which a fraction `weight` of the part beyond the joint limits is removed.
 
+    The motor command filter of the simulation: it slows joints before their stops, and the policy was trained with it.
     weight: 1 - (time until the joint reaches a limit) / horizon, in [0, 1]. Within the zone of a limit it is 1 for
     commands toward the limit, else 0; beyond a limit it is 1.
     command, pos [rad], vel [rad/s]: arrays of one shape. limits: lower, upper, and the widths lower_zone, upper_zone

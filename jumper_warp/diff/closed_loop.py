@@ -1,7 +1,9 @@
 """Differentiable closed loop of a policy and the simulation, with observations computed in PyTorch.
 
 An environment provides robots, commands, noise and all values; a `Rollout` of the same robots provides the derivatives
-of every policy step w.r.t. the action and the previous state.
+of every policy step w.r.t. the action and the previous state. Values are therefore those of an evaluation, bit for bit,
+and PyTorch's functions here need only have the right derivatives. Quaternions are xyzw, body to world; world z is up;
+`observed` is an observation as the environment computed it; a term with a history also observes earlier frames.
 """
 
 from __future__ import annotations
@@ -73,7 +75,10 @@ def heading_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
-    """Return a tensor whose values are those of `value` and whose derivatives are those of `computed`."""
+    """Return a tensor whose values are those of `value` and whose derivatives are those of `computed`.
+
+    The difference computed - computed.detach() is 0 in value only.
+    """
     return value + (computed - computed.detach())
 
 

@@ -1,6 +1,7 @@
 """Reverse pass of a differentiable rollout with one thread per leg.
 
-Four launches for every `SPAN` saved rows of the trajectory.
+Four launches for every `SPAN` saved rows of the trajectory, from the last rows to the first: recompute the steps,
+reverse them, and add the gradients w.r.t. constants of legs and of motors. Few rows at a time bound the memory.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class LegThreadReverse:
         threads = -(-num // 8) * 8
 
         def launch(kernel: Kernel, dim: tuple[int, ...], *inputs: object) -> None:  # over dim and the four legs
+            """Launch a kernel over `dim` and the four legs, in blocks of whole warps."""
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
         for end in range(rows.q.shape[0] - 1, 0, -SPAN):

@@ -396,6 +396,7 @@ class Rollout(Uncopied):
         """Launch a kernel over all worlds with a thread for each world; on a CPU concurrently over `slices`."""
 
         def launch(worlds: WorldRange) -> None:
+            """Launch the kernel for a range of worlds, which one CPU thread runs; on a GPU it is the whole range."""
             settings = self.dynamics.settings(self.dt, 1, worlds.first)
             wp.launch(
                 kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,
@@ -440,9 +441,11 @@ class Rollout(Uncopied):
         return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
 
     def _zeros(self, *shape: int, dtype: type | None = None) -> wp.array:
+        """Return an array of zeros on the rollout's device, of its precision unless `dtype` is given."""
         return wp.zeros(shape, dtype=dtype or self.real, device=self.device)
 
     def _empty(self, *shape: int, dtype: type | None = None) -> wp.array:
+        """Return an uninitialised array on the rollout's device, of its precision unless `dtype` is given."""
         return wp.empty(shape, dtype=dtype or self.real, device=self.device)
 
 

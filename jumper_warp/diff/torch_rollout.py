@@ -176,7 +176,8 @@ def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> 
 def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Container[str] | None = None) -> None:
     """Write the given robot parameters to the arrays of a rollout.
 
-    new: names to count in `Rollout.writes`, by default all.
+    `Rollout.writes` counts them, from which a reverse pass sees that a parameter is no longer that of its forward pass.
+    new: names to count, by default all.
     """
     for name, tensor in given.items():
         if name in rollout.writes and (new is None or name in new):

@@ -34,7 +34,10 @@ class WorldCamera:
     """
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
-        """Prepare images of the first `count` worlds; size: width and height [px]."""
+        """Prepare images of the first `count` worlds; size: width and height [px].
+
+        Targets and origins are infinitely far at first, so that the first image moves them to the robots.
+        """
         self._count = count
         self._size = size
         self._sim = sim
@@ -67,7 +70,11 @@ class WorldCamera:
             self._renderer = None
 
     def _follow(self, bases: np.ndarray) -> None:
-        """Move camera targets and drawing origins to the robots; bases: positions (count, 3) [m], world frame."""
+        """Move camera targets and drawing origins to the robots; bases: positions (count, 3) [m], world frame.
+
+        A target follows smoothly within DEAD_ZONE, and jumps with a robot that was reset. Origins move by whole periods
+        of the ground's pattern, so that it seems at rest.
+        """
         targets = bases + np.clip(self._targets - bases, -DEAD_ZONE, DEAD_ZONE)
         jumped = np.abs(self._targets - bases).max(axis=1) > NEAR  # also at the first image
         self._targets = np.where(jumped[:, None], bases, targets)

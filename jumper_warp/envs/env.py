@@ -297,6 +297,7 @@ class Env(Stages):
         self.skills[skill].params.set(name, value)
 
     def _check_skill(self, skill: int) -> None:
+        """Raise InputError unless `skill` is the index of one of the environment's tasks."""
         if not isinstance(skill, Integral) or not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill!r:.40}")
 
@@ -362,6 +363,7 @@ class Env(Stages):
             array.assign(host_values)
 
     def _array(self, values: np.ndarray) -> wp.array:
+        """Copy values to a float array on the environment's device, for a kernel launch."""
         return wp.array(values, dtype=float, device=self.wp_device)
 
     @locked
@@ -379,7 +381,10 @@ class Env(Stages):
 
     @locked
     def snapshot(self) -> Snapshot:
-        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
+        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device.
+
+        Targets are saved in a ring by policy step; that of the last step acts until the next one arrives.
+        """
         sim = self.sim
         n = self.num_envs
         past = wp.to_torch(self.delays.target_history)

@@ -202,6 +202,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         del self.env, self._termination
 
     def _check_open(self) -> None:
+        """Raise Gymnasium's ClosedEnvironmentError if `close` was called."""
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("the environment is closed")
 

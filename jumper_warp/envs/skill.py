@@ -84,7 +84,12 @@ class TaskRuntime:
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:
-        """Allocate observation arrays, their torch views by group, and a table of each component's settings."""
+        """Allocate observation arrays, their torch views by group, and a table of each component's settings.
+
+        A component is one number of a term; kernels read a column of the table, an `ObservationColumn`, per component.
+        Groups (actor, critic) are one flat array, each (num_envs, columns); a term with a history has a column per
+        frame, oldest first. `past`: columns of the ring buffer that delays the components with sensor latency.
+        """
         n = self.num_envs
         task = self.task
         layouts = {group: task.layout(group) for group in task.groups}
@@ -115,7 +120,13 @@ class TaskRuntime:
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
 
     def _allocate_non_finite(self, slices: int) -> None:
-        """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms."""
+        """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms.
+
+        Kernels replace NaN and infinity by 0, so that training continues. They store the first such value of each term,
+        with its world's state, which `non_finite` reports. Terms are numbered as in `_term_names`: rewards, curriculum,
+        state (diverged), observations. A slice is a range of worlds that one CPU thread advances: records of its own
+        need no atomic operations.
+        """
         task = self.task
         groups = self.task.groups
         slots = [(group, slot.term) for group in groups for slot in task.params.slots[f"observations.{group}"]]
@@ -255,7 +266,8 @@ def _finite(states: np.ndarray, field: str) -> np.ndarray:
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     """Return a task's kernels by name, built by `make_<name>_kernel` and cached, without compiling them.
 
-    Names: step, reset, set_command, observe, event. Tasks that differ only in numbers share kernels.
+    Names: step, reset, set_command, observe, event. Tasks that differ only in numbers share kernels, since numbers are
+    an argument: a variant of a task needs no compilation.
     """
     slots = task.params.slots
     compiled = {section: tuple(slot.compiled for slot in section_slots) for section, section_slots in slots.items()}

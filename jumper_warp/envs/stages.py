@@ -1,4 +1,9 @@
-"""Kernel launches of an environment's policy step and resets, in order, with their arrays."""
+"""Kernel launches of an environment's policy step and resets, in order, with their arrays.
+
+`part` is the range of worlds of a launch: all on a GPU, a slice per thread on a CPU. `mask` (num_envs,) is not 0 where
+a launch acts, so that the host makes no decision and a step can be a captured graph. A skill is a task in an
+environment of several.
+"""
 
 from __future__ import annotations
 
@@ -250,6 +255,7 @@ class Stages(Uncopied):
             wp.to_torch(array).masked_fill_(begun, 0.0)
 
     def _advance_rng(self, mask: wp.array) -> None:
+        """Increment the step count of masked worlds, so that their next reset draws other random numbers."""
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
     def _observe(self, part: WorldSlice, after_reset: int) -> None:

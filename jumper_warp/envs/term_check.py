@@ -38,7 +38,7 @@ def own_terms_alone(task: TaskCfg) -> dict[str, TaskCfg]:
     sections |= {name: getattr(task, name) for name in ("rewards", "terminations", "events")}
 
     def keeping(own: object) -> TaskCfg:
-        """Return the task with the terms of the project, and `own` among those of the user."""
+        """Return the task with the project's terms, and of the user's terms only `own`, which a crash then names."""
         kept = {name: tuple(t for t in terms if t is own or not is_own(t.func)) for name, terms in sections.items()}
         observations = ObservationsCfg(kept.pop("observations.actor"), kept.pop("observations.critic"))
         return replace(task, observations=observations, **kept)

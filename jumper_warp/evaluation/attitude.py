@@ -60,6 +60,7 @@ class AttitudeLog(EvaluationLog):
     spacing = 1.5
 
     def __post_init__(self) -> None:
+        """Allocate an outcome per world, before the first policy step."""
         self.turns, self.count = real_array(self.turns, "turns", float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment
@@ -97,7 +98,10 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def settling_time(self) -> np.ndarray:
-        """Time from which the error stays within `tolerance` to the end [s], (num_envs,); NaN if there is none."""
+        """Time from which the error stays within `tolerance` to the end [s], (num_envs,); NaN if there is none.
+
+        That is the end of the policy step after the last one whose error is larger.
+        """
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         outside = np.where((~inside).any(axis=0), len(inside) - (~inside)[::-1].argmax(axis=0), 0)
         return np.where(inside[-1], (outside + 1) * self.step_dt, np.nan)
@@ -177,6 +181,7 @@ class AttitudeFlags:
     seconds: float = 5.0  # [s] Length of every turn's episode
 
     def __post_init__(self) -> None:
+        """Raise InputError for a number of turns, angle or duration out of range."""
         if self.num_turns < len(DIRECTIONS):
             raise InputError(f"num_turns must be at least {len(DIRECTIONS)}, got {self.num_turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
@@ -201,6 +206,7 @@ class AttitudePlayFlags:
     length = 4.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
+        """Raise InputError for an angle [deg] out of range."""
         check(0.0 < self.angle <= 180.0, f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:

@@ -94,6 +94,7 @@ class FilmCfg:
     also sets the direction of the picture."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a vertical view or invalid film settings, before anything is simulated."""
         if self.eye is not None:
             import numpy as np
 
@@ -138,6 +139,7 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a length of the recording [s] out of range."""
         if self.seconds is not None and not 0.02 <= self.seconds <= 600.0:
             raise InputError(f"seconds must be in [0.02, 600], got {self.seconds}")
 

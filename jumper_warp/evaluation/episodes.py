@@ -41,6 +41,7 @@ class EpisodeLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
+        """Allocate results of one episode per world, NaN or -1 until they are known."""
         self.count = count = len(self.commands)
         self.end = np.full(count, -1)
         self.length = np.zeros(count)
@@ -227,6 +228,7 @@ class EpisodeFlags:
     seconds: float = 10.0  # [s] Maximum length of an episode
 
     def __post_init__(self) -> None:
+        """Raise InputError for a number of episodes, command or duration out of range."""
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
@@ -258,6 +260,7 @@ class EpisodePlayFlags:
     length = 10.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
+        """Raise InputError for a command or length out of range."""
         check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> EpisodeLog:

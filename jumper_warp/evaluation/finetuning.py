@@ -52,9 +52,11 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     groups = []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
+        """Return the task as evaluations use it, without platforms and blocks."""
         return task.evaluation.prepare_task(task).on_level_ground()
 
     def with_latencies(task: TaskCfg) -> TaskCfg:
+        """Return the task with nominal robots that differ only in the latency of their actions."""
         ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)
         ranges = replace(ranges, latency=task.randomization.latency)
         return replace(on_level_ground(task), randomization=ranges, events=())
@@ -178,7 +180,10 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Simulate the jumps with the current weights; return cost [1], with the trust region's penalty, and errors."""
+        """Simulate the jumps with the current weights; return cost [1], with the trust region's penalty, and errors.
+
+        The cost is half the sum of squared errors, weighted by importance, plus the penalty.
+        """
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)

@@ -37,6 +37,7 @@ class FinetuneCfg:
     had one)."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a number, standard deviation or range that fine-tuning cannot use."""
         enough = self.num_goals >= 2 and min(self.num_delayed, self.num_randomized, self.iterations) >= 0
         check(enough, "fine-tuning needs at least 2 goals; numbers of jumps and steps must not be negative")
         for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):

@@ -104,6 +104,7 @@ class JumpFlags:
     """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for no jumps, or a range of successful goals that does not rise."""
         check(self.num_jumps >= 1, f"num_jumps must be at least 1, got {self.num_jumps}")
         low, high = self.success_range
         check(0.0 <= low <= high < 10.0, f"success_range must be in [0, 10) m and rise, got {self.success_range}")
@@ -124,6 +125,7 @@ class HeightFlags(JumpFlags):
     height_range: tuple[float, float] = HeightEvaluation.height_range  # [m] Lowest and highest commanded base height
 
     def __post_init__(self) -> None:
+        """Raise InputError for heights [m] out of range, and as `JumpFlags`."""
         super().__post_init__()
         low, high = self.height_range
         check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m and rise, got {self.height_range}")
@@ -142,6 +144,7 @@ class HeightPlayFlags:
     """[s] Length of the recording, unless `jumper play --seconds` sets it."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a height [m] out of range, or more robots than a film shows."""
         fits = 1 <= len(self.height) <= MAX_ROBOTS and all(0.0 < height < 10.0 for height in self.height)
         check(fits, f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
@@ -161,6 +164,7 @@ class LandingFlags(JumpFlags):
     heading: Literal["any"] | float = "any"  # [deg] Heading of all robots, or any: sampled from the full circle
 
     def __post_init__(self) -> None:
+        """Raise InputError for goals [m] out of range or a heading that is not finite, and as `JumpFlags`."""
         super().__post_init__()
         for name in ("goal_x", "goal_y"):
             low, high = getattr(self, name)
@@ -188,6 +192,7 @@ class LandingPlayFlags:
     """[m] Goals if `goal` is not passed; a default of `goal` itself would be kept when the flag is passed."""
 
     def __post_init__(self) -> None:
+        """Raise InputError for a goal [m] out of range, or more robots than a film shows."""
         for name in ("goal", "next_goals"):
             places = getattr(self, name)
             fits = len(places) <= MAX_ROBOTS and all(-10.0 < value < 10.0 for place in places for value in place)

@@ -299,6 +299,8 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Record base positions, speeds and paw contacts after touchdown.
 
+        A paw's shift is from its last contact before takeoff to its first after touchdown. Later lifts of single paws
+        (`lift_time`) and of all (`air_time`, `takeoffs`) show whether the landed robot stands still.
         jump: arrays (n, ...) of the n worlds with a current jump; at: indices (worlds, numbers in the row) of
         these jumps; landed: (n,) whether each has touched down; step_dt [s]: policy step.
         """

@@ -91,7 +91,10 @@ class EvaluationLog(ABC):
         ]
 
     def named(self, values: Mapping[str, Any], worlds: Sequence[int]) -> Json:
-        """Select some worlds' entries of `series` or `states`, with the world's name in each key in place of {}."""
+        """Select some worlds' entries of `series` or `states`, with the world's name in each key in place of {}.
+
+        A recording has one flat dict for all its worlds, so each key names its world.
+        """
         names = list(zip(self.names(worlds), worlds, strict=True))
         return {key.format(name): values[key][world] for name, world in names for key in values}
 

@@ -67,6 +67,7 @@ class EvaluationArgs(Conditions, PrintFlags):
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
+        """Raise InputError for invalid conditions, numbers of threads or of recorded worlds."""
         super().__post_init__()
         check(self.num_recorded >= 0, f"num_recorded must not be negative, got {self.num_recorded}")
         checked_threads(self.threads)
@@ -194,6 +195,7 @@ class Run(ABC):
             recorder = EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
         def after_step() -> None:
+            """Call the caller's hook and the recorder, if any, after a policy step."""
             if on_step is not None:
                 on_step(log)
             if recorder is not None:

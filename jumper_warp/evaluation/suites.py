@@ -77,6 +77,7 @@ class Grid(Suite):
     summary: ClassVar = DistanceSweep.summary
 
     def __post_init__(self) -> None:
+        """Raise InputError for an empty grid or too many jumps, and as `Suite`."""
         super().__post_init__()
         check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
         check_jumps(self.columns * self.rows * self.num_jumps, "columns, rows and num_jumps")
@@ -108,6 +109,7 @@ class Ring(Suite):
     least: ClassVar = len(SECTORS)
 
     def __post_init__(self) -> None:
+        """Raise InputError for a radius [m] out of range, and as `Suite`."""
         super().__post_init__()
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
@@ -144,6 +146,7 @@ class Consecutive(Suite):
                          "row_goal_distance_at_rest_mean_m")  # fmt: skip
 
     def __post_init__(self) -> None:
+        """Raise InputError for no trials or too many jumps, and as `Suite`."""
         super().__post_init__()
         trials, jumps = self.num_trials, self.jumps_per_trial
         check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
@@ -228,6 +231,7 @@ class Platform(Suite):
                               for key in ("success_rate", "goal_distance_at_rest_mean_m", "fall_rate"))  # fmt: skip
 
     def __post_init__(self) -> None:
+        """Raise InputError for an edge [m] under the start or beyond the nearest goal, and as `Suite`."""
         super().__post_init__()
         low = 0.3
         high = GROUND_LOWER[0]
@@ -298,6 +302,7 @@ class Farthest(Suite):
                               for name in ("distance", "distance_flown"))  # fmt: skip
 
     def __post_init__(self) -> None:
+        """Raise InputError for distances [m] or a direction [deg] out of range, and as `Suite`."""
         super().__post_init__()
         near = self.min_distance
         far = self.max_distance

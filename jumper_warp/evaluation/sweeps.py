@@ -43,6 +43,7 @@ class Suite(EvaluationArgs, ABC):
     least: ClassVar[int] = 1  # Minimum number of jumps
 
     def __post_init__(self) -> None:
+        """Raise InputError for fewer jumps than the suite needs, or a rest time [s] out of range."""
         super().__post_init__()
         jumps = self.least
         check(self.num_jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.num_jumps}")
@@ -143,6 +144,7 @@ class HeightSweep(Sweep):
     least: ClassVar = 3
 
     def __post_init__(self) -> None:
+        """Raise InputError for heights [m] out of range, and as `Suite`."""
         super().__post_init__()
         low, high = self.height_range
         check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m, got {self.height_range}")
@@ -199,6 +201,7 @@ class DistanceSweep(Sweep):
     least: ClassVar = 3
 
     def __post_init__(self) -> None:
+        """Raise InputError for distances [m] out of range, and as `Suite`."""
         super().__post_init__()
         (near, far), side = self.distance_range, self.max_lateral_offset
         valid = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0

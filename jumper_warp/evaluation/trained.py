@@ -103,6 +103,7 @@ def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
 def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:
     """Print a warning on standard error if the robot starts in a state beyond those that training samples.
 
+    The world is put past the last curriculum level, where each reset samples one of all levels.
     start: columns `start_<field>` of the first episode. Numbers that RESETS resets never vary are skipped.
     """
     drawn = []

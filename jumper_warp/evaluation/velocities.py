@@ -49,6 +49,7 @@ class VelocityLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
+        """Allocate results of one walk per world, before the first policy step."""
         self.count = len(self.commands)
         self.end = np.full(self.count, -1)
         self.fall_step = np.zeros(self.count, dtype=int)
@@ -64,7 +65,10 @@ class VelocityLog(EvaluationLog):
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
     def begin(self, env: Env) -> None:
-        """Reset every robot to the default pose, with its first command and the task's gait frequency."""
+        """Reset every robot to the default pose, with its first command and the task's gait frequency.
+
+        The frequency is the fourth value of a command, 0 for tasks without a gait clock.
+        """
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         self._command = self._slewed(self._command, self.commands[:, 0])
@@ -182,7 +186,7 @@ class VelocityLog(EvaluationLog):
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
     def all_commands(self) -> np.ndarray:
-        """Return all commanded velocities, (robots, commands, 3)."""
+        """Return all commanded velocities ahead, to the left [m/s] and about z [rad/s], (robots, commands, 3)."""
         return self.commands
 
     def marks(self) -> dict[str, np.ndarray]:
@@ -261,6 +265,7 @@ class VelocityFlags:
     command_interval: float = 3.0  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
+        """Raise InputError for a grid of commands, an interval or a duration out of range."""
         interval = self.command_interval
         check(0.1 <= interval <= 600.0, f"command_interval must be in [0.1, 600] s, got {interval}")
         check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
@@ -294,6 +299,7 @@ class VelocityPlayFlags:
     command_interval: float = 2.5  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
+        """Raise InputError for a commanded velocity or length out of range."""
         check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))
 
     @property

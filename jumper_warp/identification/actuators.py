@@ -171,13 +171,15 @@ def characterise_motor(
     names = list(PRIORS)
     prior_std = np.array([PRIORS[name][0] for name in names])
 
-    def constants(z: np.ndarray) -> dict[str, float]:  # z: (9,) logarithms in standard deviations of their priors
+    def constants(z: np.ndarray) -> dict[str, float]:
+        """Convert z (9,), ln(value / described) in standard deviations of the priors, to constants by name."""
         values = {name: nominal[name] * math.exp(p * x) for name, p, x in zip(names, prior_std, z, strict=True)}
         values["no_load_speed"] = max(values["no_load_speed"], 1.001 * values["cutoff_speed"])
         values["fade_end"] = max(values["fade_end"], 1.001 * values["fade_start"])
         return values
 
-    def residuals(z: np.ndarray) -> np.ndarray:  # (n + 9,): torque errors over their noise, and the prior's residuals z
+    def residuals(z: np.ndarray) -> np.ndarray:
+        """Return torque errors over their noise, then z itself, the residuals of the prior, (n + 9,)."""
         return np.concatenate([(bench_torque(constants(z), bench) - bench.torque) / torque_noise, z])
 
     starts = [np.zeros(len(names))]

@@ -1,4 +1,10 @@
-"""χ² tests of a fit: of the residuals by channel and motion, and of each sensor's agreement with all others."""
+"""χ² tests of a fit: of the residuals by channel and motion, and of each sensor's agreement with all others.
+
+If the model and the noise levels are right, residuals divided by the noise have a mean square (χ²) near 1. A larger one
+reveals a wrong model, unit or sign; a sensor that disagrees with the others reveals a faulty sensor or a fit in a wrong
+local minimum. P is the number of parameters, z: parameters in standard deviations of their priors, whose own Fisher
+information is therefore the identity matrix.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +47,8 @@ def chi2_limit(count: int, fitted: float, correlation: float, level: float) -> f
     """Return the limit that the mean square of residuals (χ²) of a correct model exceeds with probability `level`.
 
     χ² is the mean square of `count` normal residuals of variance 1, of which the fit determines `fitted` (trace of the
-    hat matrix). Correlated residuals act like count / correlation independent ones.
+    hat matrix). Correlated residuals act like count / correlation independent ones. Fitted values lower the expected
+    sum of squares from `count` to count - fitted.
     """
     freedom = max(count - fitted, 1.0)
     effective = max(freedom / correlation, 1.0)
@@ -90,7 +97,10 @@ def sensors(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
 
 
 def test_level(problem: LeastSquares) -> float:
-    """Return the false-alarm probability of each single test of a fit, for `FAMILY_LEVEL` over all tests (Šidák)."""
+    """Return the false-alarm probability of each single test of a fit, for `FAMILY_LEVEL` over all tests (Šidák).
+
+    With many tests at 1 % each, a right model would often fail one of them. The level is 1 - (1 - FAMILY_LEVEL)^(1/n).
+    """
     count = len(problem.motions) + sum(len(sensor_columns(motion)) for motion in problem.motions)
     count += sum(motion.valid[:, span].any() for motion in problem.motions for _, span in motion.channels)
     return -math.expm1(math.log1p(-FAMILY_LEVEL) / count)
@@ -134,7 +144,10 @@ def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Senso
 
 
 def without(normal: NormalEquations, sensor: Sensor) -> np.ndarray:
-    """Return the change of the fitted parameters (P,) if a sensor were left out of the fit, to first order."""
+    """Return the change of the fitted parameters (P,) if a sensor were left out of the fit, to first order.
+
+    It is a Gauss-Newton step: at the fit all gradients add up to 0, so that those of the others are minus the score.
+    """
     return np.linalg.solve(normal.information() + np.eye(len(sensor.score)) - sensor.information, sensor.score)
 
 

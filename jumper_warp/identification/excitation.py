@@ -80,7 +80,8 @@ class Scorer:
     def information(self, plan: Plan, record: Record) -> np.ndarray:
         """Return the Fisher information (P, P) of a motion about the normalised parameters.
 
-        The initial state is marginalised.
+        The initial state is marginalised: what the motion reveals about both at once does not count. Information is the
+        inverse of the covariance that a fit to this motion alone would have; it adds up over motions.
         """
         motion = measure(plan, plan.kind, record, self._nominal, None, base_every=1)
         problem = MotionResiduals(motion, self.parameters, self.noise, self.replay.description)
@@ -115,8 +116,9 @@ def choose(
 ) -> Excitation:
     """Choose the most informative safe motion of several random candidates for each entry of `kinds`.
 
-    A candidate's score is the information of all motions chosen earlier and of itself. candidates: number tried by
-    motion; seconds [s]: duration of a motion. Raises InputError: no candidate of a kind is safe.
+    A candidate's score is the information of all motions chosen earlier and of itself, as 1/2 ln det: a candidate that
+    repeats what is known scores low. candidates: number tried by motion; seconds [s]: duration of a motion. Raises
+    InputError: no candidate of a kind is safe.
     """
     rng = np.random.default_rng(seed)
     size = len(scorer.parameters)

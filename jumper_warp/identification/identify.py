@@ -284,7 +284,8 @@ def descend(
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
     """Return a random change (P,) of the parameters, from a minimum to a new starting point.
 
-    normal: normal equations at the minimum.
+    It is `DISPLACEMENT` standard deviations of the estimate, correlated like its errors, so that it moves far where the
+    data say little. normal: normal equations at the minimum.
     """
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
     move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
@@ -324,7 +325,10 @@ def add_motions(
 
 
 def misfit(motion: MotionResiduals, replay: MotionReplay, z: np.ndarray) -> float:
-    """Return how badly a motion fits parameters z (P,) at the nominal initial state: mean ln(1 + residual^2)."""
+    """Return how badly a motion fits parameters z (P,) at the nominal initial state: mean ln(1 + residual^2).
+
+    The logarithm limits the effect of a few large residuals, as of a motion that diverges late.
+    """
     residuals = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
     with np.errstate(over="ignore"):
         return float(np.mean(np.log1p(np.nan_to_num(residuals, posinf=1.0e100) ** 2)))

@@ -1,4 +1,10 @@
-"""Initial states of recorded motions: their prior distribution, and the pose of a robot that stands on four paws."""
+"""Initial states of recorded motions: their prior distribution, and the pose of a robot that stands on four paws.
+
+A simulation of a recorded motion needs the state at its first row more accurately than sensors measure it, so the state
+is fitted too, from a prior around the measured one. For a standing robot, contact gives more than sensors do: all paws
+are on the ground. Motors: legs FL, FR, BL, BR, each lateral (positive outward), outer, inner (positive away from the
+other thigh). World z is up, base axes are x ahead, y left, z up, quaternions xyzw, base to world.
+"""
 
 from __future__ import annotations
 
@@ -170,7 +176,9 @@ class Stance(NamedTuple):
 def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the paws' centres [m], base frame, (N, 4 legs FL, FR, BL, BR, 3), at motor angles (N, 12) [rad].
 
-    Where the knees are too far apart for the five-bar to close, the paw is midway between them.
+    In the leg's plane the paw is one shank away from both knees, on their lower side: at half the knees' distance, and
+    by `rise` times their difference, turned by 90 degrees, below its middle. The lateral motor then turns the plane
+    about body x. Where the knees are too far apart for the five-bar to close, the paw is midway between them.
     """
     paws = np.zeros((len(angle), 4, 3))
     for k, name in enumerate(LEGS):
@@ -196,7 +204,11 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
 
 
 def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -> Stance:
-    """Compute pose and velocity of bases whose paws rest on level ground; angle [rad], rate [rad/s]: (N, 12)."""
+    """Compute pose and velocity of bases whose paws rest on level ground; angle [rad], rate [rad/s]: (N, 12).
+
+    The ground is the least-squares plane through the paws' centres, a paw radius below them. The base's twist is the
+    one with which paws at `rate` move least, normal to the ground above all.
+    """
     paws = paw_positions(description, angle)
     ahead, behind = (paw_positions(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
     paw_velocity = (ahead - behind) / (2 * STEP)
@@ -225,7 +237,7 @@ def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -
 def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the signed distance [m] (N,) of paw BR from the plane of the other three, at motor angles (N, 12) [rad].
 
-    Positive along (FR - FL) x (BL - FL), which points down.
+    Positive along (FR - FL) x (BL - FL), which points down. Only at 0 do all four paws stand.
     """
     paws = paw_positions(description, angle)
     to_fr, to_bl, to_br = (paws[:, k] - paws[:, 0] for k in (1, 2, 3))
@@ -236,7 +248,7 @@ def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
 def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the smallest motor motion, (12,) [rad/m], that moves a paw from the plane of the others (`unevenness`).
 
-    angle: (12,) [rad]."""
+    It is the gradient over its squared norm, along which the correction `levelled` is least. angle: (12,) [rad]."""
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
     return slope / (slope @ slope)
@@ -247,6 +259,7 @@ def levelled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correct motor angles [rad] and rates [rad/s], (N, 12), so that all paws lie and stay in one plane.
 
+    A paw off the ground by micrometres would strike it at a random time.
     direction: of the correction of angles and rates, (12,) [rad/m], from `levelling_direction`.
     """
     for _ in range(LEVELLING_STEPS):

@@ -1,4 +1,10 @@
-"""Least-squares fit to recorded motions by Levenberg-Marquardt; parallel worlds try all dampings of a step at once."""
+"""Least-squares fit to recorded motions by Levenberg-Marquardt; parallel worlds try all dampings of a step at once.
+
+Unknowns are P parameters, z, and the I coordinates of each motion's initial state, all in standard deviations of their
+priors: a prior adds the unknown itself as a residual, and the identity matrix to the normal matrix. Residuals are
+simulated minus measured values over the noise. Each motion's initial state is eliminated first ("marginalised"), so
+that the coupled system has only P unknowns.
+"""
 
 from __future__ import annotations
 
@@ -245,7 +251,8 @@ class LeastSquares:
     ) -> tuple[list[Point], np.ndarray]:
         """Try several values of one parameter, all other unknowns refitted to first order; return (points, costs).
 
-        index: of the parameter; moves: changes of its z, (K,). Points are a list of K, costs have shape (K,).
+        Steps downhill cannot leave a plateau, such as the friction of a paw that sticks. index: of the parameter;
+        moves: changes of its z, (K,). Points are a list of K, costs have shape (K,).
         """
         covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
         along = covariance[:, index] / covariance[index, index]
@@ -257,7 +264,9 @@ class LeastSquares:
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
         """Return the normal equations after a step, with Jacobians updated by Broyden's formula.
 
-        At `trial`, from the Jacobians of `normal` at `old`. The update's norm weighs the unknowns by their curvature.
+        At `trial`, from the Jacobians of `normal` at `old`. The update is the smallest change with which the Jacobian
+        predicts the residuals at `trial`; its norm weighs the unknowns by their curvature. It saves the simulations of
+        a finite difference.
         """
         linearised = []
         new = trial.point
@@ -276,7 +285,10 @@ class LeastSquares:
         return [residuals[:, 0] for residuals in self._costs(point.z[None], starts)[1]]
 
     def _weight(self, residual: np.ndarray) -> np.ndarray:
-        """Return the weights (m,) that residuals (m,) have in the normal equations: 1, or those of the Cauchy loss."""
+        """Return the weights (m,) that residuals (m,) have in the normal equations: 1, or those of the Cauchy loss.
+
+        The weight is the loss' slope over that of the square: outliers count less (iteratively reweighted squares).
+        """
         return 1.0 / (1.0 + (residual / (CAUCHY_WIDTH * self._typical)) ** 2) if self.robust else np.ones_like(residual)
 
     def _loss(self, residual: np.ndarray) -> np.ndarray:

@@ -55,7 +55,10 @@ class Parameter:
 
     @property
     def z_per_growth(self) -> float:
-        """Change of the normalised coordinate z per relative change of the parameter's value, at the nominal value."""
+        """Change of the normalised coordinate z per relative change of the parameter's value, at the nominal value.
+
+        With it a direction in z can be compared with the growth of several parameters by one factor.
+        """
         return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
 
     def value(self, z: np.ndarray) -> np.ndarray:

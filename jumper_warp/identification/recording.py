@@ -68,7 +68,8 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
 def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
     """Sample motor targets [deg] (ticks, 12) of a chirp with a random phase of each motor.
 
-    hung: whether the robot hangs on a stand; otherwise the motion is smaller and slower.
+    A chirp is a sine of rising frequency: it excites slow effects (friction) and fast ones (inertia, latency). hung:
+    whether the robot hangs on a stand; otherwise the motion is smaller and slower, so that it does not fall.
     """
     time = TICK * np.arange(ticks)
     slow = rng.uniform(0.3, 0.8)
@@ -179,7 +180,10 @@ def simulate_plan(
 
 
 def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool) -> Simulation:
-    """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base."""
+    """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base.
+
+    So any solver can hold the base; a force cancels its weight.
+    """
     values = RobotValues(**{name: value[:1].copy() for name, value in vars(robots).items()})
     if held:
         values.base_mass[:] = HELD_MASS

@@ -1,4 +1,7 @@
-"""Replay of recorded motor targets in parallel worlds with different robots and initial states, in double precision."""
+"""Replay of recorded motor targets in parallel worlds with different robots and initial states, in double precision.
+
+Finite differences of the motions give Jacobians; in single precision rounding would dominate them.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +124,11 @@ def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: i
 
 
 def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: RobotValues) -> None:
-    """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each."""
+    """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each.
+
+    Gains and torque limits of `robots` are factors on those of `motors`; speeds and offsets are values. Peak torques
+    are the same for all robots.
+    """
     kinds = [motors.lateral, motors.transversal, motors.transversal] * 4
     ratios = {"kp": robots.kp, "kd": robots.kd, "saturation": robots.saturation, "peak": np.ones_like(robots.kp)}
     for name, ratio in ratios.items():
@@ -133,7 +140,9 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
     """Return masses, joints and friction of N robots as the table that the kernels read, (321, N).
 
-    Rows as in `kernels.layout`; nominal: as described, (321, 1).
+    Rows as in `kernels.layout`; nominal: as described, (321, 1). A link's moments are mass, first and second moment
+    about its origin: all scale with its mass. For the base, second moments about its centre of mass scale with the mass
+    and with `base_inertia`, and are then shifted to the origin.
     """
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass = robots.base_mass[:, 0]

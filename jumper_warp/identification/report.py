@@ -103,6 +103,7 @@ def randomization_ranges(result: Identification) -> dict[str, tuple[float, float
     rows: dict[str, tuple[float, float]] = {}
 
     def widen(row: str, low: float, high: float) -> None:
+        """Extend a row's range to contain [low, high], as several parameters (motors, links) share a row."""
         old_low, old_high = rows.get(row, (low, high))
         rows[row] = (min(low, old_low), max(high, old_high))
 

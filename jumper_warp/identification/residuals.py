@@ -89,8 +89,9 @@ class MotionResiduals:
     def _make_grid(self, dt: float | None) -> float:
         """Align the rows of a recording with physics steps of at most dt [s]; return the time [s] of the first step.
 
-        Sets stride, dt, rows and the row's position on the grid. Stamps that are uniform but for `JITTER` count as
-        uniform. Raises InputError: a gap above `LONGEST_GAP`.
+        With uniform time stamps a fitted line gives the period, and each row falls on a step: the step divides the
+        period. Else rows lie between steps. Sets stride, dt, rows and the row's position on the grid. Stamps that are
+        uniform but for `JITTER` count as uniform. Raises InputError: a gap above `LONGEST_GAP`.
         """
         motion = self.motion
         index = np.arange(len(self.motion.time), dtype=float)
@@ -156,8 +157,10 @@ class MotionResiduals:
     ) -> Linearised:
         """Compute the residuals of the motion and their Jacobian w.r.t. the unknowns by one-sided differences.
 
-        At parameters z (P,) and initial state start (I,). change: step by unknown, (P + I,) or one for all. The whole
-        Jacobian is NaN if any world diverges.
+        World 0 is at parameters z (P,) and initial state start (I,), each further one changes some unknowns, as
+        `_plan_jacobian` has assigned them: where unknowns of the four legs share a world, each counts for the residuals
+        of its leg alone. change: step by unknown, (P + I,) or one for all. The whole Jacobian is NaN if any world
+        diverges.
         """
         change = np.broadcast_to(change, len(z) + len(start))
         many_z, many_start = (np.repeat(x[None], len(self.jacobian_worlds) + 1, axis=0) for x in (z, start))
@@ -211,6 +214,7 @@ class MotionResiduals:
         fraction = (self._grid_row - low)[:, None, None]
 
         def at_rows(values: np.ndarray) -> np.ndarray:
+            """Interpolate replayed values (R, ...) linearly to the times of the measured rows, (n, ...)."""
             return values[low] if not fraction.any() else (1.0 - fraction) * values[low] + fraction * values[high]
 
         columns = []
@@ -230,7 +234,8 @@ class MotionResiduals:
         """Assign each unknown that a finite difference perturbs to one of the parallel worlds.
 
         Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
-        unknown of the four legs shares a world.
+        unknown of the four legs shares a world, which saves three of four simulations. Unknowns without effect, and
+        those that contact determines, get no world; their columns of the Jacobian are 0.
         """
         size = len(self.parameters)
         single = []

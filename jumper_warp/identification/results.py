@@ -72,7 +72,10 @@ class Minimum(NamedTuple):
 
 @dataclass(frozen=True)
 class Start:
-    """Comparison of the minimum from one start of the optimisation with the best one, by cost and parameters."""
+    """Comparison of the minimum from one start of the optimisation with the best one, by cost and parameters.
+
+    Different starts that end in one minimum show that it is not a local one.
+    """
 
     excess: float  # [1] Cost above that of the best start, over χ² if that is above 1
     difference: float

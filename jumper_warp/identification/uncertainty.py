@@ -79,7 +79,8 @@ def autocorrelation(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Return the common autocorrelation [1] of series of residuals at lags 1, 2, ... up to where noise dominates.
 
     The last lag is before the first with an autocorrelation below three standard deviations of its chance value, and
-    at most `MAX_LAGS`. columns: (n,) each; series of less than 8 values do not count.
+    at most `MAX_LAGS`. It is computed by a Fourier transform of twice the length, so that the series' ends do not
+    overlap. columns: (n,) each; series of less than 8 values do not count.
     """
     lags = np.zeros(MAX_LAGS + 1)
     for values in columns:

@@ -121,6 +121,7 @@ def _no_policy(text: str, path: Path) -> str:
 def read_files(folder: Path) -> dict[str, bytes]:
     """Return the verified content of a policy's files by name, also while another process updates them.
 
+    If a check fails and the manifest has changed meanwhile, there was an update, and the files are read once more.
     Pictures may be missing. Raises PolicyError: another file is missing, one is truncated or altered, or the manifest
     is malformed or of another version.
     """
@@ -135,7 +136,10 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 
 def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the files of a policy's folder that its manifest lists. Raises PolicyError as `read_files`."""
+    """Return the files of a policy's folder that its manifest lists. Raises PolicyError as `read_files`.
+
+    A file may have the old or the new content of an update that is under way or was cut off.
+    """
     path = folder / MANIFEST
     if manifest.get("format") != FORMAT:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")

@@ -67,7 +67,8 @@ class _GraphBuilder:
 def _repeated_block(weight: np.ndarray) -> np.ndarray | None:
     """Return the block that a mirror-symmetric layer's weight has twice on its diagonal, else None.
 
-    The comparison is bitwise; the block is (out / 2, in / 2), and the rest of the weight zero.
+    The comparison is bitwise, so that loading restores the same weight; the block is (out / 2, in / 2), and the rest of
+    the weight zero.
     """
     rows, columns = (size // 2 for size in weight.shape)
     bits = weight.view(np.int32)
@@ -82,7 +83,8 @@ def onnx_model(
 ) -> onnx.ModelProto:
     """Return the ONNX model of a policy: `obs` (batch, num_obs) to `actions` (batch, num_actions), clipped to ±1.
 
-    tensors: of normaliser and layers, see `Policy.tensors`. config: configuration with the commit for the metadata.
+    It computes the same as `Policy.act`. tensors: of normaliser and layers, see `Policy.tensors`. config: configuration
+    with the commit for the metadata.
     """
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     graph = _GraphBuilder()
@@ -143,6 +145,7 @@ def onnx_bytes(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface, 
 def tensors_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     """Return the tensors of a policy's ONNX file, float32, by the names of `Policy.tensors`; inverts `onnx_bytes`.
 
+    The policy acts with its tensors, not with the graph: another graph than `onnx_model` makes of them is refused.
     data: content of the file. interface, config: from config.json; graph and metadata must agree with them.
     Raises PolicyError: the file is damaged, its tensors do not fit the interface (see `check_tensors`), or its graph,
     opset or metadata differ from the result of `onnx_model`.
@@ -197,7 +200,10 @@ def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfac
 
 
 def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise PolicyError if a layer's output could overflow float32 for some observation, by interval bounds."""
+    """Raise PolicyError if a layer's output could overflow float32 for some observation, by interval bounds.
+
+    So no observation can make an action NaN: the features are clipped, and each layer's bound follows from the last.
+    """
     bound = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
     for i in range(len(interface.sizes) - 1):
         bound = tensors[f"actor.{i}.weight"].double().abs() @ bound + tensors[f"actor.{i}.bias"].double().abs()

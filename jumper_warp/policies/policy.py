@@ -236,7 +236,10 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
 
 
 def _policy_of_rsl_rl(state: Json) -> Policy:
-    """Return the policy in a checkpoint of rsl-rl 5, `saved`, with the `config` (`env`, perhaps `train`) beside it."""
+    """Return the policy in a checkpoint of rsl-rl 5, `saved`, with the `config` (`env`, perhaps `train`) beside it.
+
+    Its normaliser adds RSL_RL_EPS to the standard deviation; without one, observations are left as they are.
+    """
     config = state["config"]
     saved = state["saved"]
     actor = saved["actor_state_dict"]
@@ -448,7 +451,10 @@ def check_interface(policy: PolicyInterface, task: Json) -> None:
 
 
 def _compared_values(policy: PolicyInterface, task: Json) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value)."""
+    """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value).
+
+    With another order, scale or default angle the network would get or command other quantities than it has learned.
+    """
     for label, field in (("observation", "observation_names"), ("action", "joint_names")):
         for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):
             yield f"{label} {column}", names[0], names[1]

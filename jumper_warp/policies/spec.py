@@ -150,7 +150,10 @@ def _check_filter(fields: Json) -> None:
 
 
 def _check_layout(layout: Json, width: int) -> None:
-    """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps."""
+    """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps.
+
+    A term's columns are `history` frames of equal width.
+    """
     first = 0
     for name, term in layout.items():
         where = f"observation_layout {name!r:.60}"

@@ -42,7 +42,10 @@ def all_ranks_agree(agreed: bool) -> bool:
 
 
 def same_on_all_ranks(text: str) -> bool:
-    """Return whether all processes pass the same text (blocking)."""
+    """Return whether all processes pass the same text (blocking).
+
+    The maxima of a hash d and of -d over all processes are d and -d only if all are equal. Seven bytes fit an int64.
+    """
     digest = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
     return all_reduce_max([digest, -digest]) == [digest, -digest]
 

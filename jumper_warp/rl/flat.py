@@ -1,4 +1,8 @@
-"""Adam optimiser on flat vectors: parameters, gradients and moments of actor and critic are one vector each."""
+"""Adam optimiser on flat vectors: parameters, gradients and moments of actor and critic are one vector each.
+
+One vector takes one kernel and one all-reduce, where a tensor per parameter takes dozens. Tensors of shape () live on
+the device, so that no step waits for the host.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +116,8 @@ def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torc
 
     It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A smaller kl
     than 1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within
-    cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
+    cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0. PPO assumes small updates; a rate that holds the KL
+    divergence near desired_kl makes them as large as that allows.
     """
     if cfg.desired_kl <= 0.0:
         return lr

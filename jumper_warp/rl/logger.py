@@ -274,7 +274,10 @@ class Scores:
         self._values: list[float] = []
 
     def add(self, metrics: dict[str, float]) -> None:
-        """Add the value of a log line, if half of the worlds have reached the last curriculum level."""
+        """Add the value of a log line, if half of the worlds have reached the last curriculum level.
+
+        Success at easy levels says little about the whole task, and would make an early checkpoint the best one.
+        """
         levels, score = level_fractions(metrics), metrics.get(self._metric, math.nan)
         at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
         if math.isfinite(score) and (not levels or at_end >= 0.5):

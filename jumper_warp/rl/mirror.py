@@ -3,6 +3,10 @@
 A mirror map takes a vector x to its mirror image `signs * x[order]`; it is its own inverse. Let M be the mirror map of
 observations, N the mirror map of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2. For any
 weights it maps M x to the mirror image of its output for x.
+
+A plain network computes the same if each hidden layer holds those of f(x) and f(M x), one above the other: the first
+layer has the weights W and W M, later ones blocks W on the diagonal, the last one (W, N W) / 2. Policies are saved in
+this form, which needs no mirror maps.
 """
 
 from __future__ import annotations

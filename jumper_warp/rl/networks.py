@@ -30,7 +30,8 @@ class Moments(NamedTuple):
     def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
         """Return mean, population variance and count over the first axis of x (batch, ...).
 
-        chunk_size: rows per chunk, in two passes, six times as fast on a CPU (default: all rows, in one pass).
+        chunk_size: rows per chunk, in two passes, six times as fast on a CPU (default: all rows, in one pass). Squared
+        differences from the mean do not cancel, unlike the mean square minus the squared mean.
         """
         if chunk_size is None:
             var, mean = torch.var_mean(x, dim=0, correction=0)

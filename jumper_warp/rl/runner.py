@@ -360,7 +360,10 @@ class TrainingRun:
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, is_last: bool, stop: StopRequest) -> None:
-        """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one."""
+        """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one.
+
+        It also holds the states of the other ranks' environments, so that a resumed training continues identically.
+        """
         seconds = self.clock.elapsed()
         local = {
             "ppo": self.ppo.state_dict(),

@@ -81,7 +81,9 @@ def gae(
 def update_statistics(model: ActorCritic, local: RolloutMoments, obs_mirror: MirrorMap | None, cfg: PpoCfg) -> Scaling:
     """Update a model's running moments by those of a rollout over all ranks; return the normalisation of advantages.
 
-    local: moments of this rank's samples. obs_mirror: map that symmetrises those of the actor's observations.
+    Advantages are normalised over the batch of all ranks, with the unbiased variance. local: moments of this rank's
+    samples. obs_mirror: map that symmetrises those of the actor's observations: a mirror-symmetric actor needs a mean
+    and a variance that mirror images share.
     """
     moments = RolloutMoments(*all_reduce_moments(local))
     obs_moments = moments.obs

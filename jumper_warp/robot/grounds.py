@@ -116,7 +116,9 @@ def _nodes(size: float, cell: float) -> np.ndarray:
 def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: float) -> np.ndarray:
     """Return smooth random heights (nodes, nodes) with a Gaussian correlation exp(-(distance / length)^2), mean 0.
 
-    cell, length: [m].
+    White noise is smoothed in the frequency domain, by a filter whose square has the spectrum of that correlation,
+    exp(-(wave number * length)^2 / 4). Heights have no unit: the caller scales them. cell: distance of nodes, length:
+    correlation length [m].
     """
     padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: opposite rims must not correlate
     wave = 2.0 * np.pi * np.fft.fftfreq(padded, cell)

@@ -1,4 +1,8 @@
-"""Dimensions of a leg, and knee angles that close its loop."""
+"""Dimensions of a leg, and knee angles that close its loop.
+
+Two thighs and two shanks form a planar loop (five-bar): the motors set both thigh angles, and the knees follow. Thigh
+angles are positive away from the other thigh, 0 straight down. The outer thigh is farther from the body's middle.
+"""
 
 from __future__ import annotations
 

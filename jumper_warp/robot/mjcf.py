@@ -1,4 +1,8 @@
-"""Export of the robot as an MJCF model of MuJoCo: closed loops, stops, position servos, ground and default pose."""
+"""Export of the robot as an MJCF model of MuJoCo: closed loops, stops, position servos, ground and default pose.
+
+MJCF describes a tree of bodies: each leg's loop is cut at the ankle and closed by an equality constraint. Quaternions
+are wxyz in MJCF and xyzw in this project; sizes of shapes are halved.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
 """Construction of the robot's Newton model and of the leg constants that the kernels read.
 
 Per world, `joint_q` holds the base (position [m], quaternion xyzw), then per leg in FL, FR, BL, BR order the angles
-[rad] lateral, outer, outer knee, inner, inner knee, then per leg the quaternion of the ankle's loop joint.
+[rad] lateral, outer, outer knee, inner, inner knee, then per leg the quaternion of the ankle's loop joint. Newton's
+model is a tree of links plus a loop joint per leg; stiffness and damping below serve its MuJoCo solver, while
+SolverJumper has rigid contacts and exact loops.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Settings of the motors and of the motor command filter, and the kernel structures made of them."""
+"""Settings of the motors and of the motor command filter, and the kernel structures made of them.
+
+The command filter keeps joints off their stops and links apart: it changes a target only if its joint would soon
+violate a limit. Angles are lateral (positive outward) and transversal, i.e. outer and inner (positive away from the
+leg's other thigh); their sum is the angle between the thighs. Torques and speeds are at the joint, behind the gear.
+"""
 
 from __future__ import annotations
 
@@ -132,6 +137,7 @@ def motor_arrays(
         raise InputError(f"motors must be a MotorCfg, got {cfg!r:.60}")
 
     def per_motor(lateral: float, transversal: float) -> wp.array:
+        """Return a constant of the two kinds of motors for every motor and world, (12, num_worlds)."""
         column = np.tile([lateral, transversal, transversal], 4)[:, None]
         values = np.repeat(column, num_worlds, axis=1)
         return wp.array(values, dtype=module.real, device=device, requires_grad=requires_grad)

@@ -1,4 +1,7 @@
-"""Robot overlays: JSON files with values that replace those of the description, and randomisation ranges."""
+"""Robot overlays: JSON files with values that replace those of the description, and randomisation ranges.
+
+An identification writes one for each real robot, which differs a little from its description.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Data classes of a robot description."""
+"""Data classes of a robot description: one for each element of the URDF, and for loops and motors, which it lacks.
+
+Link frames are parallel to the body's (x ahead, y left, z up) when all joint angles are 0.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Terrain map of square tiles: difficulty grows along x, and the kind of ground changes along y."""
+"""Terrain map of square tiles: difficulty grows along x, and the kind of ground changes along y.
+
+A curriculum moves a robot to a harder row after a success, and to an easier one after a fall. World z is up.
+"""
 
 from __future__ import annotations
 

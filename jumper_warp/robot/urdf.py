@@ -19,6 +19,7 @@ class UrdfReader:
     """Reader of a URDF file's links and joints."""
 
     def __init__(self, file: Path):
+        """Read and parse the file, and the colours of its materials, which shapes name."""
         self.file = file
         self.text = file.read_text(encoding="utf-8")
         self.root = ElementTree.fromstring(self.text)

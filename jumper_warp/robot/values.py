@@ -99,7 +99,10 @@ def described(values: RobotValues, description: RobotDescription) -> RobotDescri
 
 
 def _described_motor(motor: Motor, value: Mapping[str, float]) -> Motor:
-    """Return a copy of a motor type with one robot's armature, friction, gains and speeds, by `MOTOR_QUANTITIES`."""
+    """Return a copy of a motor type with one robot's armature, friction, gains and speeds, by `MOTOR_QUANTITIES`.
+
+    A description has the rotor's inertia before the gear, which counts gear_ratio^2 times at the joint (armature).
+    """
     jumping, walking = (Gains(value["kp"] * pd.kp, value["kd"] * pd.kd) for pd in (motor.jumping, motor.walking))
     return replace(
         motor,

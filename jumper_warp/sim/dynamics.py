@@ -282,7 +282,8 @@ class JumperDynamics:
     def _workspace(self) -> KernelStruct:
         """Allocate the arrays that the solver's kernels write, such as impulses, forces and torques, all zero.
 
-        The reference pose is the model's `joint_q`. Returned as the kernels' `Workspace`.
+        They persist between launches: a step begins with the last one's impulses. A diverged world is put into the
+        reference pose, the model's `joint_q`. Returned as the kernels' `Workspace`.
         """
         scalar = self.modules.scalar
         n = self.num_worlds
@@ -310,7 +311,11 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Copy masses, joints, friction, gravity and knee springs from the model to the kernels' parameter table."""
+        """Copy masses, joints, friction, gravity and knee springs from the model to the kernels' parameter table.
+
+        The table has a row of all worlds for each parameter, in the kernels' precision. A change of the model's arrays
+        has no effect until it is copied.
+        """
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -345,7 +350,8 @@ class JumperDynamics:
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
         """Update masses, armature and friction of some worlds in the kernels' parameter table, from the model.
 
-        mask: (num_worlds,) float, not 0 in worlds to update. worlds: range in which the mask is read, by default all.
+        One thread for each of the 21 links and four legs of a world. mask: (num_worlds,) float, not 0 in worlds to
+        update. worlds: range in which the mask is read, by default all.
         """
         m = self.model
         first, count = worlds or (0, self.num_worlds)
@@ -492,8 +498,9 @@ class JumperDynamics:
     ) -> None:  # fmt: skip
         """Correct the base's velocity in qd so that only gravity changes the momentum of a robot in free flight.
 
-        Call it after `advance` by `time` [s]. momenta: before that call. body_f: wrenches during it; a robot with a
-        contact or a wrench on its base stays uncorrected. worlds: range, by default all.
+        The integrator (semi-implicit Euler) lets the momentum drift while legs move. Call it after `advance` by `time`
+        [s]. momenta: before that call. body_f: wrenches during it; a robot with a contact or a wrench on its base stays
+        uncorrected. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.diverged, time, q, qd]
@@ -504,8 +511,9 @@ class JumperDynamics:
     ) -> None:
         """Compute knee and ankle joints, and poses and velocities of all links, from base and motor coordinates.
 
-        All joint coordinates are in q, qd: those of base and motors are read, the others written. body_q: poses [m],
-        xyzw; body_qd: velocities [m/s], [rad/s]. worlds: range, by default all.
+        No step reads what it writes, which sensors, viewers and collision tests of links need. All joint coordinates
+        are in q, qd: those of base and motors are read, the others written. body_q: poses [m], xyzw; body_qd:
+        velocities [m/s], [rad/s]. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         wp.launch(
@@ -519,7 +527,8 @@ class JumperDynamics:
     def clear_contact(self, mask: wp.array) -> None:
         """Clear warm starts, contact forces and divergence flags of the worlds in a mask.
 
-        mask: (num_worlds + 1,) bool; the last entry belongs to no world.
+        A warm start is the impulse of the last step, with which the contact iteration of the next one begins. mask:
+        (num_worlds + 1,) bool; the last entry belongs to no world.
         """
         outputs = [self.work.impulse, self.work.contact_force, self.work.diverged]
         wp.launch(clear_contact_kernel, self.num_worlds, [mask], outputs, device=self.device)
@@ -552,5 +561,8 @@ class JumperDynamics:
         """
 
     def carried(self) -> dict[str, wp.array]:
-        """Return by name the arrays, besides joint_q, joint_qd and impulses, that the next step depends on: none."""
+        """Return by name the arrays, besides joint_q, joint_qd and impulses, that the next step depends on: none.
+
+        A saved state of an environment must hold them, so that it continues identically.
+        """
         return {}

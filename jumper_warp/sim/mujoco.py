@@ -67,7 +67,10 @@ def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newto
 
 
 def take_knee_damping(model: Model) -> float:
-    """Set the damping of all knees of a model to 0, and return that of world 0's first knee before [N m s/rad]."""
+    """Set the damping of all knees of a model to 0, and return that of world 0's first knee before [N m s/rad].
+
+    MuJoCo's own damper has no limit of its torque; `MujocoDynamics` adds one that has.
+    """
     damping = model.joint_damping.numpy().reshape(model.world_count, -1)
     knee_damping = float(damping[0, KNEE_DOFS[0]])
     damping[:, KNEE_DOFS] = 0.0
@@ -131,7 +134,10 @@ class MujocoDynamics(JumperDynamics):
             self._step(state, motors, target if delay is None else self._arrived, dt, restart=i == 0)
 
     def _step(self, state: State, motors: KernelStruct, target: wp.array, dt: float, restart: bool) -> None:
-        """Advance one physics step towards motor targets [rad], (12, num_worlds); restart: reset peak forces."""
+        """Advance one physics step towards motor targets [rad], (12, num_worlds); restart: reset peak forces.
+
+        Motor torques are written to the joints first; then torques of knees, springs and stops of sums are added.
+        """
         q, qd = state.joint_q, state.joint_qd
         joint_f = self._control.joint_f
         work = self.work
@@ -146,7 +152,7 @@ class MujocoDynamics(JumperDynamics):
             self._launch_on(paw_force_kernel, self.num_worlds, [self._sensor.total_force, int(restart)], outputs)
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Make SolverMuJoCo read changed parameters of all worlds; ignores mask and range."""
+        """Make SolverMuJoCo read changed parameters of all worlds; ignores mask and range, which Newton cannot take."""
         self.solver.notify_model_changed(RANDOMIZED_FLAGS)
 
     def after_reset(self, mask: wp.array) -> None:

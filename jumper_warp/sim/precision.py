@@ -38,8 +38,8 @@ def float64_kernels() -> ModuleType:
 class KernelModules:
     """Warp kernel modules of the robot's dynamics, in single or double precision.
 
-    Each is an attribute, named after the module, and is imported at its first use. Both precisions have the types of
-    single precision.
+    Each is an attribute, named after the module, and is imported at its first use. For a type checker both precisions
+    are the modules of single precision.
     """
 
     if TYPE_CHECKING:

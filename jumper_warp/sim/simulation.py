@@ -307,7 +307,8 @@ class Simulation(Uncopied):
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
         """Run kernel launches for all worlds; from the second call of a name on they are replayed as a captured graph.
 
-        body: launches them for a range of worlds. Within a capture it is called directly.
+        The first call launches them directly, which loads their modules: a capture cannot. body: launches them for a
+        range of worlds. Within a capture it is called directly.
         """
         with WARP_LOCK:
             if self.device.is_capturing:
@@ -386,7 +387,10 @@ class Simulation(Uncopied):
 
     @locked
     def loop_gap(self) -> np.ndarray:
-        """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,)."""
+        """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,).
+
+        On SolverJumper it is a rounding error, since loops are closed by construction; SolverMuJoCo's are soft.
+        """
         model = self.model
         parents, children = model.joint_parent.numpy(), model.joint_child.numpy()
         frames = self.state.body_q.numpy()
@@ -414,6 +418,7 @@ def _values_of(robot: RobotOverlay | RobotValues | None, friction: float) -> Rob
 def motor_values(joint_values: np.ndarray) -> np.ndarray:
     """Return the 12 motors' entries of an array with one value for each joint.
 
-    joint_values: (..., 20 or more), the joints after the base. Returned: (..., 12).
+    joint_values: (..., 20 or more), the joints after the base: of each leg lateral, outer, outer knee, inner, inner
+    knee, of which the knees have no motor. Returned: (..., 12).
     """
     return joint_values[..., [5 * leg + j for leg in range(4) for j in (0, 1, 3)]]

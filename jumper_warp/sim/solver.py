@@ -176,7 +176,10 @@ class SolverJumper(SolverBase):
         self, state_in: State, state_out: State, drive: KernelStruct, dt: float, substeps: int,
         observables: SolverBase.Observables | None, bodies: bool, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
-        """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
+        """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`.
+
+        Accelerations of bodies are changes of their velocities over the whole call, divided by its time.
+        """
         substeps = check_step(dt, substeps)
         self._check_state("state_in", state_in)
         if state_out is not state_in:

@@ -1,4 +1,7 @@
-"""Bounds of the numbers of terms and of randomisation ranges, both in a configuration and in `Env.set`."""
+"""Bounds of the numbers of terms and of randomisation ranges, both in a configuration and in `Env.set`.
+
+Kernels do not check their numbers: a width of 0 would give NaN rewards, a negative mass a diverging simulation.
+"""
 
 from __future__ import annotations
 

@@ -32,9 +32,11 @@ class Copyable:
         return {spec.name: getattr(self, spec.name) for spec in fields}
 
     def __copy__(self) -> Self:
+        """Return a copy made by the constructor, which checks its arguments again."""
         return type(self)(**self.arguments())
 
     def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """Return a deep copy; Warp functions and structs are shared, as a copy of them would be another kernel."""
         arguments = self.arguments().items()
         return type(self)(**{name: value if _is_named(value) else copy.deepcopy(value, memo)
                              for name, value in arguments})  # fmt: skip
@@ -85,7 +87,7 @@ def top_level(definition: Any) -> tuple[ModuleType | None, str, str]:
 
 
 def _is_named(value: object) -> bool:
-    """Return whether a value is a Warp function or struct."""
+    """Return whether a value is a Warp function or struct, which copies share and pickles refer to by name."""
     return isinstance(value, wp.Function | Struct)
 
 

@@ -1,4 +1,8 @@
-"""Checks of a task's Warp functions and structs, before a kernel is compiled."""
+"""Checks of a task's Warp functions and structs, before a kernel is compiled.
+
+Warp's own errors name generated code; these name the user's file and line. "Own" means a user's, from outside the
+project, whose functions need no check.
+"""
 
 from __future__ import annotations
 
@@ -99,6 +103,7 @@ def _may_end_without_result(func: Any) -> bool:
     """Return whether a Warp function returns a value on some paths but not on all; on the others Warp returns zeros."""
 
     def returns(statements: list[ast.stmt]) -> bool:
+        """Return whether every path through the statements reaches a `return`."""
         return any(
             isinstance(each, ast.Return) or (isinstance(each, ast.If) and returns(each.body) and returns(each.orelse))
             for each in statements

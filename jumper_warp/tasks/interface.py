@@ -1,4 +1,8 @@
-"""Description of the inputs and outputs of a task's policies, as plain data that is saved with every policy."""
+"""Description of the inputs and outputs of a task's policies, as plain data that is saved with every policy.
+
+A program that runs a policy, as on the robot, needs no other part of this package to turn sensor readings into an
+observation and an action into motor targets.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +23,11 @@ def interface(task: TaskCfg) -> dict[str, Any]:
     """
 
     def per_motor(lateral: float, transversal: float) -> list[float]:
+        """Return a constant of the two kinds of motors for each of the 12 motors: lateral, outer, inner by leg."""
         return [lateral, transversal, transversal] * (len(MOTOR_JOINTS) // 3)
 
     def torque(kind: MotorKindCfg) -> float:
+        """Return the largest torque [N m] of a kind of motor: the controller's limit or the motor's."""
         return min(kind.saturation, kind.peak)
 
     motors = task.motors

@@ -1,4 +1,8 @@
-"""Left-right mirror maps of a task's observations and actions, as permutations and signs."""
+"""Left-right mirror maps of a task's observations and actions, as permutations and signs.
+
+A mirror-symmetric policy needs them: the robot is symmetric about its x-z plane. A term's mirror image is given by
+columns counted from 1, negative where the sign changes.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ class Mirror(NamedTuple):
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
     """Return the left-right mirror map of a task's observation; group: "actor" or "critic".
 
+    Each frame of a term's history is mirrored on its own: columns of the term become columns of the observation.
     Raises InputError: the mirror image of a term is not known.
     """
     columns: list[int] = []

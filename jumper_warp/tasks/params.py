@@ -91,8 +91,9 @@ class ParamArrays:
 
     @locked
     def set(self, name: str, value: float) -> None:
-        """Change a term's parameter, given by its dotted name, on the device.
+        """Change a term's parameter, given by its dotted name, on the device: in `values`, which the kernels read.
 
+        `changed` holds the same numbers, and is saved with the environment's state.
         Raises InputError: there is none, or the term refuses the value in a configuration too.
         """
         i = self.params.index(name)

@@ -1,4 +1,7 @@
-"""Domain randomisation (paper, Table V): ranges of physical parameters, and the events that sample them."""
+"""Domain randomisation (paper, Table V): ranges of physical parameters, and the events that sample them.
+
+A policy that is trained on many similar robots also works on the real one, whose parameters are not known exactly.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +112,10 @@ class RandomizationCfg:
 
     @property
     def nominal_friction(self) -> float:
-        """Return the paws' friction coefficient [1] for evaluations without randomisation."""
+        """Return the paws' friction coefficient [1] for evaluations without randomisation.
+
+        Where training samples it, the middle of the default range, else the default of the simulation.
+        """
         return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
 
     def in_tests(self) -> RandomizationCfg:
@@ -126,6 +132,7 @@ class RandomizationCfg:
         terms = []
 
         def add(func: Function, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
+            """Add an event that samples within a range, unless it is None; scale: from the range's unit to SI."""
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
                 terms.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **numbers))

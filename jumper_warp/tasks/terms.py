@@ -158,14 +158,17 @@ class Term(Copyable):
         return {"func": self.func, "name": self.name, **self.numbers, **self.options}
 
     def __eq__(self, other: object) -> bool:
+        """Return whether function, name and all values are equal."""
         return type(self) is type(other) and all(
             getattr(self, name) == getattr(other, name) for name in ("func", "name", "numbers", "options")
         )
 
     def __hash__(self) -> int:
+        """Return a hash of type and name alone, since values may be unhashable; equal terms have equal hashes."""
         return hash((type(self), self.name))
 
     def __repr__(self) -> str:
+        """Return the term's name and values, for messages."""
         numbers = "".join(f", {key}={value!r}" for key, value in {**self.numbers, **self.options}.items())
         return f"{type(self).__name__}({self.name}{numbers})"
 
@@ -181,6 +184,7 @@ class RewardTerm(Term):
     returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: Function, weight: float, **values: Any) -> None:
+        """Store a reward function with its parameters by name, and its weight."""
         super().__init__(func, weight=weight, **values)
 
     @property
@@ -346,5 +350,6 @@ class StateMetric:
     """Field whose sum over all worlds divides the sum of `field`; None: log the mean of `field` and keep it."""
 
     def __post_init__(self) -> None:
+        """Add the group Metrics/ to a name without a group, under which training logs show it."""
         if "/" not in self.name:
             object.__setattr__(self, "name", f"Metrics/{self.name}")

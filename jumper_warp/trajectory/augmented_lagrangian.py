@@ -70,9 +70,15 @@ def minimise(
 
 
 class _Descent:
-    """State of an optimisation by the augmented Lagrangian method, for all starts in parallel."""
+    """State of an optimisation by the augmented Lagrangian method, for all starts in parallel.
+
+    Shapes: points `x` (starts, n), `step` [1], `penalty` and the last largest `violation` (starts,), multipliers
+    (starts, constraints); `pairs` are L-BFGS's past steps, changes of the gradient and inverse products, the oldest
+    first; `previous`: point and gradient before the last step.
+    """
 
     def __init__(self, problem: Problem, begin: np.ndarray, step: float, seed: int):
+        """Place all starts at `begin` (starts, n), without curvature, multipliers or best points; see `minimise`."""
         real = torch.float64 if problem.double else torch.float32
         self.problem = problem
         device = str(problem.rollout(len(begin)).device)
@@ -87,7 +93,11 @@ class _Descent:
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian of candidates, the function to minimise, (starts * repeat,)."""
+        """Return the augmented Lagrangian of candidates, the function to minimise, (starts * repeat,).
+
+        A multiplier shifts the point from which a constraint's violation is penalised, so that the minimum satisfies
+        the constraints with a finite penalty. repeat: number of candidates by start.
+        """
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
@@ -96,7 +106,11 @@ class _Descent:
         return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
 
     def iterate(self, number: int) -> None:
-        """Take one L-BFGS step of every start; every `OUTER`-th iteration (`number`) also updates the multipliers."""
+        """Take one L-BFGS step of every start; every `OUTER`-th iteration (`number`) also updates the multipliers.
+
+        Each start moves to the best of the tried points if that is better. Its step grows if the longest one was the
+        best, and shrinks if a short one or none was.
+        """
         values, gradient = self.problem.gradient(self.x, self.merit)
         self._keep_best(self.x, values, 1)
         if number and number % OUTER == 0:
@@ -132,7 +146,10 @@ class _Descent:
         self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
     def _add_pair(self, gradient: torch.Tensor) -> None:
-        """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature."""
+        """Store the last step and the change of the gradient over it, from which L-BFGS estimates curvature.
+
+        Starts with curvature below 0 in this step get the factor 0, which leaves the pair out.
+        """
         if self.previous is None:
             return
         moved = self.x - self.previous[0]
@@ -142,7 +159,11 @@ class _Descent:
         self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(convex, 1.0 / product, 0.0))]
 
     def _direction(self, gradient: torch.Tensor) -> torch.Tensor:
-        """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
+        """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box.
+
+        The loops multiply the gradient by an approximate inverse Hessian, made of past steps and the gradient's changes
+        (`pairs`); a start without such a pair, or whose direction would ascend, follows the gradient.
+        """
         out = ((self.x <= -1.0) & (gradient > 0.0)) | ((self.x >= 1.0) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
         # names as in the book's algorithm 7.4

@@ -7,7 +7,8 @@ observations, original actions a0 and damping c, a step d solves by conjugate gr
 
 where A is the derivative of a w.r.t. the weights and S = 1 / (m s^2), with m observations and s the allowed change of
 the actions. The terms with S are the Gauss-Newton terms of the mean squared change of the actions, which is
-proportional to the KL divergence from the original policy; A^T S A is the metric of the natural gradient.
+proportional to the KL divergence from the original policy; A^T S A is the metric of the natural gradient. They keep the
+policy close to the one that was trained for robustness, as few recorded jumps do not determine all weights.
 """
 
 from __future__ import annotations
@@ -84,7 +85,9 @@ def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
     """Return the gradient of each world's loss w.r.t. `Network.weights`, (worlds, num_weights).
 
     total: scalar sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
-    tape: of all policy steps, filled by `Network.act`.
+    tape: of all policy steps, filled by `Network.act`. One backward pass gives the gradient w.r.t. the outputs of every
+    layer, which still has a row per world; a layer's weight gradient in a world is the sum over steps of the outer
+    product of that row and the layer's input.
     """
     outs = [out for layers in tape for _, out in layers]
     by_out = torch.autograd.grad(total, outs, retain_graph=True, allow_unused=True)
@@ -139,7 +142,10 @@ class Anchor:
             self.actions = network.act(obs)
 
     def residuals(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12)."""
+        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12).
+
+        m: number of recorded observations, so that the sum of squares does not grow with their number.
+        """
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:
@@ -174,7 +180,8 @@ def gauss_newton_step(
     for jacobian, error, weight in zip(jacobians, errors, importance, strict=True):
         right = right - jacobian.T @ (weight * error)
 
-    def apply(v: torch.Tensor) -> torch.Tensor:  # product of the equation's matrix and v
+    def apply(v: torch.Tensor) -> torch.Tensor:
+        """Return the product of the equation's matrix and a vector v (num_weights,), without forming the matrix."""
         out = damping * v + back(jvp(anchor.residuals, (weights,), (v,))[1])[0]
         for jacobian, weight in zip(jacobians, importance, strict=True):
             out = out + jacobian.T @ (weight * (jacobian @ v))

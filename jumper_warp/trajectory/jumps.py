@@ -2,6 +2,10 @@
 
 Each function returns a `Term`: for a motion of `num` worlds an objective (num,) to minimise, or constraints (..., num)
 that are satisfied where <= 0, scaled to about 1. speed [m/s]: upward speed of the base that defines takeoff.
+
+Terms are differentiable: roots and bounds have small offsets (1e-12 and the like) that keep gradients finite. Rows of a
+motion are policy steps (1/60 s); `motion.q` has the base's position, orientation (xyzw) and 12 motor angles, world
+frame, x ahead, z up. Decisions, such as the row of takeoff, have no gradient.
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ def flight(motion: SimulatedMotion, speed: float, height: float) -> tuple[torch.
     """
 
     def distance_and_time() -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the flight; `motion.once` calls it at the first use, since several terms share the result."""
         takeoff = motion.momentum_at_takeoff(speed)
         start = motion.start
         landing = height + start.com[:, 2] - motion.q[0, :, 2]
@@ -55,6 +60,7 @@ def highest() -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return minus the apex: z + v^2 / 2g of the highest flying row, or z alone where the base falls already."""
         height, up = motion.q[..., 2], motion.base_velocity[..., 2]
         row, _ = motion.takeoff(0.25)
         later = torch.arange(len(height), device=row.device)[:, None] >= row
@@ -74,6 +80,7 @@ def positive_work() -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the work until takeoff; entry i of `positive_work` is the work until row i + 1."""
         row = motion.takeoff(0.25)[0]
         return 0.01 * motion.positive_work[row - 1, torch.arange(motion.num, device=row.device)]
 
@@ -98,6 +105,7 @@ def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Te
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return how far the landing pitch is above +limit and below -limit [rad], (2, num)."""
         (row, _) = motion.takeoff(speed)
         (_, time) = flight(motion, speed, height)
         rate = motion.momentum_at_takeoff(speed).spin[:, 1] / motion.start.inertia[:, 1, 1]
@@ -114,9 +122,13 @@ def stays(limit: float, speed: float = 0.25) -> Term:
 
 
 def leans_back(limit: float, speed: float = 0.25) -> Term:
-    """Return the objective that rewards moving the base back before takeoff: minus the distance [m], up to `limit`."""
+    """Return the objective that rewards moving the base back before takeoff: minus the distance [m], up to `limit`.
+
+    The base then has a longer way to accelerate ahead.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return minus the largest distance behind the start (-x) before takeoff, (num,)."""
         back = motion.q[0, :, 0] - motion.q[..., 0]
         return -torch.where(before_takeoff(motion, speed), back, 0.0).amax(0).clamp_max(limit)
 
@@ -127,6 +139,7 @@ def drifts(limit: float) -> Term:
     """Return the constraint that the base moves horizontally by at most `limit` [m] during the whole motion."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the horizontal distance from the start less the limit [m], (steps + 1, num)."""
         offset = motion.q[..., :2] - motion.q[0, :, :2]
         return (offset.square().sum(-1) + 1.0e-12).sqrt() - limit
 
@@ -140,6 +153,7 @@ def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the lacking height of the lowest link in units of 0.1 m, (steps + 1, num); 0 in rows that are out."""
         gap = 10.0 * (margin - motion.clearance.amin((-1, -2)))
         return gap if speed is None else torch.where(before_takeoff(motion, speed), gap, 0.0)
 
@@ -147,9 +161,13 @@ def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
 
 
 def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
-    """Return the constraint that hind paws on the ground are at most `limit` [m] ahead of their start until takeoff."""
+    """Return the constraint that hind paws on the ground are at most `limit` [m] ahead of their start until takeoff.
+
+    The distance of a jump counts from the start; steps ahead before the takeoff would be part of it.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return how far the foremost hind paw is beyond the limit [m], (steps, num); 0 in rows that do not count."""
         hind_x = motion.ankles[..., 2:, 0]  # paws BL, BR
         ahead = hind_x[1:].amax(-1) - hind_x[0].amax(-1) - limit
         counts = motion.down[:, 2:].any(1) & before_takeoff(motion, speed)[:-1]
@@ -165,6 +183,7 @@ def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return 0 for worlds that take off, else a positive value that shrinks as the lowest paw rises, (num,)."""
         lowest = (motion.ankles[-1, ..., 2] - motion.body.paw_radius).amin(-1)
         took_off = motion.takeoff(speed)[1]
         return torch.where(took_off, 0.0, 10.0 * (lift - lowest).clamp_min(0.0) + 0.01)
@@ -176,6 +195,7 @@ def upright(limit: float, at_end: bool = True) -> Term:
     """Return the constraint that the base tilts by at most `limit` [rad], at the end or (not at_end) at all times."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return 2 sin(tilt / 2) - 2 sin(limit / 2), about tilt - limit [rad]; x, y of the quaternion give the tilt."""
         quat = motion.q[-1:, :, 3:7] if at_end else motion.q[..., 3:7]
         x, y = quat[..., 0], quat[..., 1]
         return 2.0 * (x.square() + y.square() + 1e-12).sqrt() - 2.0 * math.sin(0.5 * limit)
@@ -189,7 +209,10 @@ def reaches(height: float) -> Term:
 
 
 def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
-    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4 paws FL, FR, BL, BR, num)."""
+    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4 paws FL, FR, BL, BR, num).
+
+    It stays true after a paw's first contact, even if the paw lifts again.
+    """
     row, _ = motion.takeoff(speed)
     later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
     down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])
@@ -203,6 +226,7 @@ def soft(limit: float, speed: float = 0.25) -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the acceleration above the limit in units of 10 g, (steps, num); -1, satisfied, before takeoff."""
         up = motion.base_velocity[..., 2]
         acceleration = (up[1:] - up[:-1]) / (motion.substeps * motion.dt * motion.gravity)
         later = torch.arange(len(up), device=up.device)[1:, None] > motion.takeoff(speed)[0]
@@ -219,6 +243,7 @@ def lifted(dead_band: float = 0.001) -> Term:
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the penalty (num,): heights of paws that have touched down, over time, and of all at the end."""
         height = (motion.ankles[..., 2] - motion.body.paw_radius - dead_band).clamp_min(0.0).movedim(2, 1)
         step = motion.substeps * motion.dt
         return 100.0 * (step * torch.where(touchdowns(motion), height, 0.0).sum((0, 1)) + height[-1].sum(0))
@@ -230,6 +255,7 @@ def rest() -> Term:
     """Return the objective of ending at rest: squared final speed [m^2/s^2] + angular velocity [rad^2/s^2] / 10."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
+        """Return the penalty (num,), from the last row's rates: com velocity, then angular velocity of the base."""
         last = motion.qd[-1]
         return last[:, :3].square().sum(-1) + 0.1 * last[:, 3:6].square().sum(-1)
 

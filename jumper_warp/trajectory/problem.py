@@ -88,6 +88,10 @@ class SimulatedMotion:
     """
 
     def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
+        """Wrap a trajectory; body: kinematics of the robot of `rollout`.
+
+        Quantities are computed at first use and kept, since objective and constraints share them.
+        """
         self.trajectory = trajectory
         self.body = body
         self.gravity = gravity
@@ -147,7 +151,8 @@ class SimulatedMotion:
         """
         return self.once(("takeoff", speed), lambda: self._takeoff(speed))
 
-    def _takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:  # `takeoff` without the cache
+    def _takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute `takeoff`, without its cache; `down` row i is that of row i + 1 of the state."""
         airborne = ~self.down.any(dim=1) & (self.base_velocity[1:, :, 2].detach() > speed)
         return torch.where(airborne.any(0), airborne.int().argmax(0) + 1, len(airborne)), airborne.any(0)
 

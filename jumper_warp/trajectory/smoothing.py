@@ -65,7 +65,10 @@ def penalised(values: Values, penalty: float = 20.0) -> torch.Tensor:
 
 
 def exact(values: Values) -> torch.Tensor:
-    """Return the exact penalty function (n,): the objective plus `EXACT` times the largest violation."""
+    """Return the exact penalty function (n,): the objective plus `EXACT` times the largest violation.
+
+    Its minimum satisfies the constraints, since the weight exceeds the multipliers; the quadratic penalty's does not.
+    """
     return values.objective + EXACT * values.constraints.clamp_min(0.0).amax(1)
 
 
@@ -86,7 +89,10 @@ def sort_by_merit(
 
 
 def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> torch.Tensor:
-    """Return the augmented Lagrangian (n,) of n candidates, which equals `penalised` for multipliers (n, m) of 0."""
+    """Return the augmented Lagrangian (n,) of n candidates, which equals `penalised` for multipliers (n, m) of 0.
+
+    With the right multipliers its minimum satisfies the constraints at a moderate penalty.
+    """
     pressed = (multipliers + 2.0 * penalty * values.constraints).clamp_min(0.0)
     return values.objective + (pressed.square() - multipliers.square()).sum(1) / (4.0 * penalty)
 
@@ -94,6 +100,7 @@ def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> tor
 def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
     """Return new starts, each of which joins the first knots of a start to the last knots of another, random one.
 
+    A good push-off of one start can so meet a good landing of another; gradients alone move every start by itself.
     Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
     shifted in time by up to `SHIFT` knots.
     """
@@ -116,7 +123,10 @@ def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.rando
 
 
 def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch.Tensor:
-    """Return initial Lagrange multipliers (n, m) with the penalty's gradient at x; if not `dual`, zeros (n, 1)."""
+    """Return initial Lagrange multipliers (n, m) with the penalty's gradient at x; if not `dual`, zeros (n, 1).
+
+    An earlier stage ended where this gradient balances the objective's, so the descent continues without a jump.
+    """
     if not stage.dual:
         return x.new_zeros(len(x), 1)
     with torch.no_grad():
@@ -124,9 +134,13 @@ def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch
 
 
 class _BestPoints:
-    """Best point x (n, len(knots)) and lowest merit (n,) that the descent from each start has found so far."""
+    """Best point x (n, len(knots)) and lowest merit (n,) that the descent from each start has found so far.
 
-    def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):  # x: starts
+    A descent along smoothed gradients can become worse, and then continues from this point.
+    """
+
+    def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):
+        """Evaluate the starts x (n, len(knots)), the first best points; stage: whose merit ranks points."""
         self.problem, self.stage = problem, stage
         self.x = x
         self.merit = merit_of(problem, x, stage.merit)

@@ -1,7 +1,10 @@
 """Kinematics and momentum of the robot as functions of PyTorch tensors, for objectives of trajectories.
 
-States are rows of `Trajectory`: q (..., 19) and qd (..., 18), coordinates last. Positions and velocities are in the
-world frame, quaternions xyzw.
+States are rows of `Trajectory`: q (..., 19) and qd (..., 18), coordinates last: base position, orientation (xyzw) and
+12 motor angles; velocity of the base's centre of mass, angular velocity and 12 motor rates. Positions and velocities
+are in the world frame, z up. Motors of a leg: lateral (positive outward), outer, inner (positive away from the other
+thigh). A leg's housing turns about body x by side * lateral; links turn about housing +y, 0 for one along -z. The
+formulas are those of the kernels (`five_bar`, `leg_dynamics`); PyTorch differentiates them.
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
 
 
 def _rotation_x(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) about x, given cosine and sine of the angle (...)."""
+    """Return rotation matrices (..., 3, 3) about x, given cosine and sine of the angle (...); differentiable."""
     one = torch.ones_like(cos)
     zero = torch.zeros_like(cos)
     return torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).unflatten(-1, (3, 3))
@@ -200,7 +203,8 @@ class WholeBody:
         rest = torch.stack([zero, zero, zero], dim=-1)
         outer, inner = (torch.stack([knee_vx[..., i], zero, knee_vz[..., i]], dim=-1) for i in (OUTER, INNER))
 
-        def links(thighs: torch.Tensor, shanks: torch.Tensor) -> torch.Tensor:  # interleave outer and inner links
+        def links(thighs: torch.Tensor, shanks: torch.Tensor) -> torch.Tensor:
+            """Interleave values (..., 2) of thighs and shanks: outer thigh, outer shank, inner thigh, inner shank."""
             return torch.stack([thighs, shanks], dim=-1).flatten(-2)
 
         return (
@@ -213,7 +217,8 @@ class WholeBody:
         base_rotation, base_pos, base_vel, base_ang = self._base(q, qd)
         legs = self.legs(q, qd)
 
-        def links(base: torch.Tensor, legs_part: torch.Tensor, axes: int) -> torch.Tensor:  # base and 20 leg links
+        def links(base: torch.Tensor, legs_part: torch.Tensor, axes: int) -> torch.Tensor:
+            """Join values of the base and of the 20 leg links along one axis; axes: axes of a link's value."""
             first = base.dim() - axes
             return torch.cat([base.unsqueeze(first), legs_part.flatten(first, first + 1)], dim=first)
 

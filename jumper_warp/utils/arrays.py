@@ -32,7 +32,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float32) -> np.ndarray:
 
 
 def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[str, np.ndarray]:
-    """Return the arrays of an npz file by name; pickled objects are refused.
+    """Return the arrays of an npz file by name; pickled objects are refused, since loading one runs its code.
 
     purpose: content of the file, for messages. error: class of the error. Raises `error`: it is no regular file, larger
     than MAX_BYTES, also unpacked, damaged, or holds something else; the message has the path.

@@ -93,7 +93,10 @@ def _integer(value: Any) -> int | None:
 
 
 def check_flags(**flags: Any) -> None:
-    """Raise InputError unless all values are bools of Python or NumPy: the text "no" is true; flags: values by name."""
+    """Raise InputError unless all values are bools of Python or NumPy; flags: values by name.
+
+    Another type would count silently: to Python the text "no" is true.
+    """
     for name, value in flags.items():
         if not isinstance(value, bool) and getattr(getattr(value, "dtype", None), "kind", "") != "b":
             raise InputError(f"{name} must be True or False, got {value!r:.40}")
@@ -157,7 +160,7 @@ def _shown(hint: Any) -> str:
 
 
 def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float, str]]) -> None:
-    """Raise InputError if a number, or one of a pair of numbers, is outside its range; None passes.
+    """Raise InputError if a number, or one of a pair of numbers, is outside its range; None, an unset option, passes.
 
     cfg: object with the fields that `bounds` names; bounds: (lower, upper, unit) by field. section: name of `cfg`, for
     messages.
@@ -183,7 +186,8 @@ def check_seed(value: Any) -> int:
 def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:
     """Raise InputError unless limits of an angle [deg] are finite and in order, and zones inside do not overlap.
 
-    lower_zone, upper_zone: widths of the zones inside the limits [deg], >= 0.
+    lower_zone, upper_zone: widths of hard zones inside the limits [deg], >= 0, in which a command filter clamps
+    commands toward the limit at any speed.
     """
     if not -FILTER_ANGLE <= lower < upper <= FILTER_ANGLE:
         raise InputError(

@@ -25,6 +25,7 @@ MAX_DIGITS = 18  # Characters of an integer in JSON; all these are exact as int6
 def directory_lock(folder: Path) -> Iterator[int]:
     """Hold the lock of a directory while files in it are replaced; waits until other processes and threads release it.
 
+    Without it two writers of one file would share its temporary file.
     Yields the directory's descriptor. No file is written. There is no lock on network file systems that do not support
     one. OSError: no such folder.
     """

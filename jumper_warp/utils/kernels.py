@@ -53,7 +53,10 @@ def content_hash(*parts: Any) -> bytes:
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
-    """Compile the modules of kernels in parallel, or load them from Warp's cache, and wait; see `loading_kernels`."""
+    """Compile the modules of kernels in parallel, or load them from Warp's cache, and wait; see `loading_kernels`.
+
+    Warp itself compiles a module at its first launch, one after the other.
+    """
     with loading_kernels(kernels, device):
         pass
 
@@ -70,6 +73,7 @@ def loading_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) ->
     remaining = iter(list(variants))
 
     def load() -> None:
+        """Load modules until none remains; all workers take them from one iterator."""
         for module, block in remaining:
             wp.force_load(device, [module], block, 0)
 

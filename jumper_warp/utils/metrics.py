@@ -120,7 +120,8 @@ def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
 def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda ratio: ratio) -> MetricValue:
     """Return a metric, `function` of the ratio of two columns' sums, with a bootstrap interval over the rows.
 
-    rows: (trials, 2), the second column numbers of samples; function: of the ratio.
+    Whole trials are resampled, since the samples of one trial depend on each other. rows: (trials, 2), the second
+    column numbers of samples; function: of the ratio.
     """
     rows = rows[rows[:, 1] > 0]
     if not len(rows):
@@ -139,7 +140,10 @@ def largest(values: ArrayLike, over: str = "") -> MetricValue:
 
 
 def resampled_means(rows: np.ndarray) -> np.ndarray:
-    """Return the column means (RESAMPLES, columns) of bootstrap samples that are drawn from rows (n, columns)."""
+    """Return the column means (RESAMPLES, columns) of bootstrap samples that are drawn from rows (n, columns).
+
+    The seed is fixed, so that equal results have equal intervals.
+    """
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     n = len(rows)
     at_once = max(1, min(RESAMPLES, BATCH // n))

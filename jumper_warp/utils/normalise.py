@@ -6,5 +6,8 @@ import torch
 
 
 def normalise(obs: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limit: float) -> torch.Tensor:
-    """Normalise observations (..., n) by mean and standard deviation (n,), and clamp them to ± limit."""
+    """Normalise observations (..., n) by mean and standard deviation (n,), and clamp them to ± limit.
+
+    The clamp keeps a rare outlier, as of an observation with a small deviation, from dominating the network.
+    """
     return ((obs - mean) / std).clamp(-limit, limit)

@@ -71,7 +71,10 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
 
 @functools.cache
 def _report_once(device: str | None, threads: int) -> DeviceInfo:
-    """Print a line about a device at the first call with these arguments, and return the device's properties."""
+    """Print a line about a device at the first call with these arguments, and return the device's properties.
+
+    The cache keeps a script with several environments from repeating the line.
+    """
     info = device_info(device)
     if info.driver is None:
         line = f"device: {info.alias} ({threads} thread{'s' if threads > 1 else ''})"

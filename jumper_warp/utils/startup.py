@@ -49,6 +49,7 @@ class DeferredLoader(Loader):
     """Loader that turns a module into a `DeferredModule` instead of executing it by its own loader."""
 
     def __init__(self, loader: Loader) -> None:
+        """Store the module's own loader, which runs at the first use of the module."""
         self.loader = loader
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
@@ -61,7 +62,7 @@ class DeferredLoader(Loader):
 
 
 class DeferredFinder(MetaPathFinder):
-    """Import finder that defers the code of the modules in `DEFERRED` to their first use."""
+    """Import finder that defers the code of the modules in `DEFERRED` to their first use, which saves their time."""
 
     def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Return the specification of a deferred module, None for any other module."""
@@ -100,6 +101,6 @@ def prepare_imports() -> None:
 
 
 def _after_first_collection(phase: str, info: dict[str, int]) -> None:
-    """Collect garbage more often after the first collection, since the imports are over."""
+    """Collect garbage more often after the first collection, since the imports are over; arguments: of gc.callbacks."""
     gc.set_threshold(COLLECTION_THRESHOLD)
     gc.callbacks.remove(_after_first_collection)

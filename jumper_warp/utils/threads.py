@@ -71,6 +71,7 @@ def locked(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Any:
+        """Call the function while holding the lock."""
         with WARP_LOCK:
             return function(*args, **kwargs)
 
@@ -124,7 +125,10 @@ def limit_spinning() -> None:
 
 
 def stop_spinning() -> None:
-    """Limit torch to one CPU thread if its idle threads spin (see `limit_spinning`) and OMP_NUM_THREADS is not set."""
+    """Limit torch to one CPU thread if its idle threads spin (see `limit_spinning`) and OMP_NUM_THREADS is not set.
+
+    Spinning threads would occupy the cores of the simulation.
+    """
     global _torch_spins
     if _torch_spins and "OMP_NUM_THREADS" not in os.environ:
         sys.modules["torch"].set_num_threads(1)
@@ -168,6 +172,9 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
 
 
 def _run_jobs() -> None:
-    """Loop of a worker thread: take jobs of `run_in_parallel` calls from the queue and run them, without end."""
+    """Loop of a worker thread: take jobs of `run_in_parallel` calls from the queue and run them, without end.
+
+    It is a daemon thread, which ends with the process.
+    """
     while True:
         _jobs.get()()

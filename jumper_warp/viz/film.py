@@ -143,7 +143,8 @@ def _interpolated(recording: Recording, values: np.ndarray, times: np.ndarray) -
 def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
     """Return the bodies' poses in a film, (times, bodies, 7), interpolated to times [s].
 
-    Worlds are spaced apart.
+    Position [m] and quaternion xyzw, world frame; worlds are spaced apart along y. A quaternion and its negative are
+    the same rotation: the nearer one is the end of the linear interpolation, which is then normalised.
     """
     after = np.clip(np.searchsorted(recording.times, times), 1, max(1, len(recording.times) - 1))
     after = np.minimum(after, len(recording.times) - 1)
@@ -206,7 +207,10 @@ def _encode_mp4(path: Path, target: Path, images: Iterator[Image.Image], size: t
 
 
 def _encoded_animation(images: Iterator[Image.Image], kind: str, fps: float, count: int) -> bytes:
-    """Return `count` images as the content of a file with a repeating animation; kind: webp or gif."""
+    """Return `count` images as the content of a file with a repeating animation; kind: webp or gif.
+
+    Durations are differences of rounded times, so that rounding errors do not add up.
+    """
     pictures = list(images)
     data = io.BytesIO()
     tick = 10 if kind == "gif" else 1  # [ms] unit of the durations in the file

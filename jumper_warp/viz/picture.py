@@ -140,7 +140,10 @@ def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = N
 
 
 def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
-    """Return (first, last) frame of every flight of a world in which the base rises by RISE, in order."""
+    """Return (first, last) frame of every flight of a world in which the base rises by RISE, in order.
+
+    A walk may also have short moments without contact, in which the base hardly rises.
+    """
     height = recording.body_poses(rank)[:, 0, 2]
     free = ~(np.linalg.norm(recording.contact_forces[:, rank], axis=-1) > CONTACT).any(axis=-1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(int)))
@@ -169,6 +172,7 @@ def _spread(frames: list[int], count: int) -> list[int]:
 def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
     """Choose up to MOST frames of a recording, at least GAP apart in the picture, those of important events first.
 
+    Order: apexes, end, start, touchdowns, takeoffs; then the frame that is farthest from the chosen ones, to fill gaps.
     places: base positions in the picture [m], (num_frames, 2), to the right and up.
     """
     apexes = [first + int(np.argmax(places[first : last + 1, 1])) for first, last in flights]
@@ -193,7 +197,10 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` frames between which the bodies move equally far; poses: (num_frames, bodies, 3 or more)."""
+    """Choose `count` frames between which the bodies move equally far; poses: (num_frames, bodies, 3 or more).
+
+    The last of them lies just before the end of the motion, since the robot may rest for long after it.
+    """
     steps = np.linalg.norm(np.diff(poses[..., :3], axis=0), axis=-1).sum(axis=1)
     moved = np.concatenate([[0.0], np.cumsum(steps)])
     return np.searchsorted(moved, np.linspace(0.0, 0.99 * moved[-1], count))
@@ -257,7 +264,7 @@ def _opacity(scene: Composition) -> np.ndarray:
 
 
 def _extent(scene: Composition) -> np.ndarray:
-    """Return the points that the picture must show, (n, 3) [m]: robots with their labels, scale and bars."""
+    """Return the points that the picture must show, (n, 3) [m], world frame: robots with labels, scale and bars."""
     low, high = scene.span()
     ground = scene.lowest - 0.1
     heights = [*scene.heights, *([ground] if scene.grounded else [])]
@@ -273,7 +280,10 @@ def _extent(scene: Composition) -> np.ndarray:
 
 
 def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View, tuple[int, int]]:
-    """Return the view from a direction that shows all points, and the image size [px], as high as necessary."""
+    """Return the view from a direction that shows all points, and the image size [px], as high as necessary.
+
+    A first view in the highest image measures how high the content is.
+    """
     size = (width, HEIGHTS[1] * width // WIDTH)
     pixels = fit(points, direction, size, FIELD_OF_VIEW).project(points, size)
     needed = float(np.ptp(pixels[:, 1]) / np.ptp(pixels[:, 0])) * width

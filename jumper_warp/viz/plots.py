@@ -131,7 +131,10 @@ def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]], *, ideal:
 
 
 def plot_running_mean(axis: Any, commanded: np.ndarray, error: np.ndarray) -> None:
-    """Plot the running mean of errors [m] over commands [m], (jumps,) each, with its 95 % bootstrap interval."""
+    """Plot the running mean of errors [m] over commands [m], (jumps,) each, with its 95 % bootstrap interval.
+
+    It shows systematic errors, which single jumps hide. Jumps with a NaN error are left out.
+    """
     order = np.argsort(commanded)[~np.isnan(error)[np.argsort(commanded)]]
     if len(order) < WINDOW[0]:
         return
@@ -252,7 +255,10 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Seq
 
 
 def path_limits(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y limits [m] of a plot of paths [m], (paths, steps, 2); the y range is at least x range / 5."""
+    """Return x and y limits [m] of a plot of paths [m], (paths, steps, 2).
+
+    The y range is at least x range / 5, so that a straight path's panel, which has equal scales, is not too flat.
+    """
     low, high = (limit(paths, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
     middle = 0.5 * (low + high)
     size = np.maximum(1.1 * (high - low), 0.2)

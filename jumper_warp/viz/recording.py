@@ -132,7 +132,7 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
-    """Build a recording from a NumPy archive; header: its decoded JSON entry `header`."""
+    """Build a recording, without checks, from a NumPy archive; header: its decoded JSON entry `header`."""
     shapes = tuple(
         ShapeMesh(
             shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)
@@ -159,7 +159,11 @@ def _check(name: str, valid: Any) -> None:
 
 
 def _check_arrays(recording: Recording) -> None:
-    """Raise RecordingError for an array of another type or shape, or times or meshes that cannot be drawn."""
+    """Raise RecordingError for an array of another type or shape, or times or meshes that cannot be drawn.
+
+    A file may come from anywhere, and drawing a malformed one would fail with an obscure error. Poses of a diverged
+    world may be anything in later frames, which are not drawn.
+    """
     frames, worlds, bodies = (len(part) for part in (recording.times, recording.worlds, recording.bodies))
     contacts, goals = recording.contact_points.shape[2:3], recording.goals.shape[1:2]
     for name, *shapes in (
@@ -191,7 +195,10 @@ def _check_arrays(recording: Recording) -> None:
 
 
 def _check_names(recording: Recording) -> None:
-    """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies."""
+    """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies.
+
+    Names become paths of entities in the Rerun viewer, so that their parts must be as expected.
+    """
     worlds = recording.worlds
     frames = len(recording.times)
     _check("worlds", worlds and all(type(world) is int and world >= 0 for world in worlds))

@@ -115,9 +115,11 @@ class Renderer(ABC):
         """Free the renderer's resources; it cannot draw afterwards."""
 
     def __enter__(self) -> Renderer:
+        """Return the renderer itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the renderer."""
         self.close()
 
 
@@ -160,6 +162,7 @@ class GLRenderer(Renderer):
         self._viewer.set_model(self.model)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        """Return an image of the poses in `state`, drawn by Newton's viewer in its invisible window."""
         viewer = self._viewer
         camera = self._viewer.camera
         viewer.renderer._make_current()  # another window may have drawn since
@@ -213,6 +216,7 @@ class RayTracer(Renderer):
         self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        """Return an image of the poses in `state`, without lines; Newton's cameras look along their -z axis."""
         from newton.sensors import SensorCamera
         from scipy.spatial.transform import Rotation
 
@@ -259,7 +263,10 @@ def _gl_viewer(size: tuple[int, int]) -> Any:
 
 
 def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float]) -> Model:
-    """Build a Newton model of all robots to draw, one copy of the robot's links for each entry of `opacity`."""
+    """Build a Newton model of all robots to draw, one copy of the robot's links for each entry of `opacity`.
+
+    It is only drawn: links are kinematic, without mass and collisions. Both of Newton's renderers draw a model.
+    """
     builder = newton.ModelBuilder()
     builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
     meshes = [
@@ -279,7 +286,10 @@ def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence
 
 
 def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-    """Convert polylines to line segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
+    """Convert polylines to line segments: return starts, ends [m], world frame, and colors; an arrow is one segment.
+
+    All are arrays of vec3, as Newton's viewer draws them; None hides the lines of the last image.
+    """
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]

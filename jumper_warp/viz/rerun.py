@@ -165,7 +165,7 @@ class _Writer:
 
 
 def _world_names(recording: "Recording") -> list[str]:
-    """Return distinct names of the recorded worlds for entity paths."""
+    """Return distinct names of the recorded worlds for entity paths: two worlds in one entity would overwrite."""
     labels = [recording.label(rank) for rank in range(len(recording.worlds))]
     return labels if len(set(labels)) == len(labels) else [f"world_{world}" for world in recording.worlds]
 

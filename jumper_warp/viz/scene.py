@@ -36,7 +36,10 @@ class Label:
 
 
 def valid_frames(recording: Recording, rank: int) -> int:
-    """Return the number of frames before a world diverges: a pose is not finite, or the base is FAR from its start."""
+    """Return the number of frames before a world diverges: a pose is not finite, or the base is FAR from its start.
+
+    Later frames are not drawn: the camera would have to show all of them.
+    """
     poses = recording.body_poses(rank)
     valid = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(poses[:, 0] - poses[0, 0])[:, :3] < FAR).all(axis=1)
     return int(np.argmin(np.append(valid, False)))
@@ -99,7 +102,10 @@ def fit(points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_
 def _nearest(
     points: np.ndarray, target: np.ndarray, unit: np.ndarray, size: tuple[int, int], field_of_view: float
 ) -> float:
-    """Return the least distance [m] from target to eye, along a unit vector, from which all points are in view."""
+    """Return the least distance [m] from target to eye, along a unit vector, from which all points are in view.
+
+    Found by bisection: the points are in view from every larger distance. size: of the image [px]; field_of_view [deg].
+    """
     low = 0.1
     high = 200.0
     for _ in range(40):
@@ -130,7 +136,7 @@ def follow(paths: np.ndarray, dt: float) -> np.ndarray:
 def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarray) -> list[Line]:
     """Return arrows of a world's commanded and actual horizontal velocity at a point [m], world frame, if any.
 
-    The actual velocity is the mean over VELOCITY_WINDOW.
+    The actual velocity is the mean over VELOCITY_WINDOW, which smooths the sway of the base.
     """
     if not len(recording.commands) or not np.isfinite(recording.commands[frame, rank]).all():
         return []

@@ -1,7 +1,9 @@
 """Motor command filter (Olsen et al., Section III): clamps targets to limits, more firmly the sooner these are reached.
 
-A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
-m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
+It keeps motors off their stops and links off one another, whatever the policy commands, and leaves a target free while
+its joint is far from the limits. Angles are positive outward (lateral), and away from the leg's other thigh (outer,
+inner). A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With
+margins m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
 
     t = min( m_u / max(x', v_0), m_l / max(-x', v_0) )
 
@@ -83,7 +85,7 @@ def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3
     """Return one leg's motor targets [rad] after the command filter; vectors are (lateral, outer, inner), vel [rad/s].
 
     The limits of each motor act first. The limits of the transversal sum then act on the sum of the two results, and
-    each transversal command takes half of that correction.
+    each transversal command takes half of that correction: outer - inner, which swings the leg, stays as commanded.
     """
     t, h, v = params.transversal, params.horizon, params.speed_floor
     lateral = limit_command(wp.clamp(target[0], -COMMAND_BOUND, COMMAND_BOUND), pos[0], vel[0], params.lateral, h, v)
@@ -110,8 +112,9 @@ def command_filter_kernel(
 ):
     """Write every leg's motor targets after the command filter; launch over (4, worlds), from world `first` on.
 
-    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds. offset [rad],
-    (12, num_worlds): reading minus true angle of each position sensor; the filter uses the reading.
+    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds; after the base's
+    7 coordinates (6 rates) come five joints a leg: lateral, outer, outer knee, inner, inner knee. offset [rad],
+    (12, num_worlds): reading minus true angle of each position sensor; the filter uses the reading, as on the robot.
     """
     leg, world = wp.tid()
     world += first

@@ -1,7 +1,9 @@
 """Passive forces of a leg in motor space, implicit in time: friction, damping and the hard stops that it presses.
 
 Each force is linear in the rates after the step, tau = b - C q'(t + dt), so that it adds dt C to the inertia and
-b - C q'(t) to the torque: stiff stops stay stable at any step size.
+b - C q'(t) to the torque: stiff stops stay stable at any step size. Friction and capped damping are not linear: each is
+replaced by the damper that has the same torque at the rates q'(t). Motor space: lateral (positive outward), outer and
+inner angle (positive away from the leg's other thigh).
 """
 
 import warp as wp
@@ -40,7 +42,11 @@ class JointForces:
 
 @wp.func
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
-    """Return damping coefficients [N m s/rad] equivalent to a leg's motor damping and friction at `rates` [rad/s]."""
+    """Return damping coefficients [N m s/rad] equivalent to a leg's motor damping and friction at `rates` [rad/s].
+
+    A friction torque F at a rate w is the damping F / |w|, which the implicit step brings to rest without chatter. The
+    floor `FRICTION_SPEED` keeps it finite.
+    """
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
         p.damping[1] + p.friction[1] / wp.max(wp.abs(rates[1]), FRICTION_SPEED),
@@ -50,13 +56,20 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return a damping coefficient [N m s/rad], reduced if its torque at `rate` [rad/s] would exceed `limit` [N m]."""
+    """Return a damping coefficient [N m s/rad], reduced if its torque at `rate` [rad/s] would exceed `limit` [N m].
+
+    The knees' dampers saturate: with a constant coefficient they would take energy from a jump that the robot keeps.
+    """
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 
 @wp.func
 def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat33:
-    """Return the motor-space damping matrix [N m s/rad] of a leg's passive knees; front, rates: see `joint_forces`."""
+    """Return the motor-space damping matrix [N m s/rad] of a leg's passive knees; front, rates: see `joint_forces`.
+
+    A knee turns with both transversal motors, so it damps a combination g . q' of their rates: c g g^T per knee, with
+    its coefficient c and gradient g.
+    """
     zero = real(0.0)
     # knee rate = shank rate - thigh rate, per outer and inner motor rate
     outer_knee = vec3(zero, loop.outer_shank_do + front, loop.outer_shank_di)

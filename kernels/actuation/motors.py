@@ -1,4 +1,8 @@
-"""Motor model: position control, torque-speed envelope and over-speed protection."""
+"""Motor model: position control, torque-speed envelope and over-speed protection.
+
+Motors are numbered 3 * leg + j: legs FL, FR, BL, BR; j lateral, outer, inner. A positive torque raises the motor's
+angle: it swings the paw outward (lateral), or the thigh away from the leg's other thigh (outer, inner).
+"""
 
 import warp as wp
 
@@ -68,6 +72,7 @@ def motor_torque(target: real, pos: real, vel: real, motor: MotorParams) -> real
     """Return a motor's torque [N m] at the joint for a target [rad], the true position [rad] and speed [rad/s].
 
     Position control, bounded by the torque-speed envelope; then over-speed protection fades driving and braking alike.
+    The controller only knows the sensor's reading, the true position plus `offset`.
     """
     command = motor.kp * (target - (pos + motor.offset)) - motor.kd * vel
     bounded = wp.clamp(command, -envelope(real(-1.0), vel, motor), envelope(real(1.0), vel, motor))
@@ -89,7 +94,8 @@ def motor_torque_kernel(
 ):
     """Write the motor torques [N m] to their entries of Newton's joint_f; launch over (12, num_worlds).
 
-    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay.
+    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay. The
+    base has the first 7 coordinates and 6 rates of a world; `motor_slot` skips the passive knees.
     """
     motor, world = wp.tid()
     coord = coords_per_world * world + 7 + motor_slot(motor)

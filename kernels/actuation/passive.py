@@ -1,6 +1,8 @@
 """Explicit passive torques for Newton's SolverMuJoCo: capped knee damping, stops of outer + inner angle, springs.
 
-`SolverJumper` includes them, damping and stops implicitly (`joint_forces`, `stops`, `springs`).
+MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles, so these are added to its joint
+forces before each step. `SolverJumper` includes them, damping and stops implicitly (`joint_forces`, `stops`,
+`springs`).
 """
 
 import warp as wp
@@ -19,7 +21,8 @@ wp.set_module_options({"enable_backward": False})
 def stop_torque(angle: real, rate: real, lower: real, upper: real, ke: real, kd: real) -> real:
     """Return the torque [N m] of a pair of hard stops: a spring, with damping while the penetration grows.
 
-    angle, lower, upper [rad], rate [rad/s], ke [N m/rad], kd [N m s/rad]. The torque is 0 within [lower, upper].
+    angle, lower, upper [rad], rate [rad/s], ke [N m/rad], kd [N m s/rad]. The torque is 0 within [lower, upper]. No
+    damping acts on the way out, where it would pull the joint toward the stop.
     """
     if angle < lower:
         return ke * (lower - angle) - wp.where(rate < real(0.0), kd * rate, real(0.0))
@@ -46,10 +49,10 @@ def passive_torque_kernel(
 ):
     """Apply every leg's passive torques [N m] to joint_f: knee damping, hard stops of outer + inner angle, and springs.
 
-    Those of the knees replace its entries, the others are added; one thread per (world, leg). knee_damping [N m s/rad]
-    acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of outer + inner angle; stop_ke [N m/rad], stop_kd
-    [N m s/rad] must be soft enough for explicit integration. springs (num_worlds,): stiffness [N/m] and rest length
-    [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
+    Those of the knees replace its entries, which no motor writes; the others are added to the motors' torques. One
+    thread per (world, leg). knee_damping [N m s/rad] acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of
+    outer + inner angle; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough for explicit integration. springs
+    (num_worlds,): stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
     """
     world, leg = wp.tid()
     q = world * COORDS + 7 + 5 * leg  # joints: lateral, outer motor, outer knee, inner motor, inner knee

@@ -1,4 +1,8 @@
-"""Kernels that read motor values, paw forces and the base's velocity from Newton's arrays."""
+"""Kernels that read motor values, paw forces and the base's velocity from Newton's arrays.
+
+Motors are 3 * leg + j: legs FL, FR, BL, BR; j lateral, outer, inner. Newton's joint arrays also hold the base, the
+passive knees and the loop joints, which these kernels skip. Forces and velocities are in the world frame, z up.
+"""
 
 import warp as wp
 
@@ -77,7 +81,10 @@ def base_velocity_kernel(
     # out
     velocity: wp.array(dtype=wp.vec3),
 ):
-    """Write the velocity of the base link's origin [m/s], world frame, (num_worlds,); one thread per world."""
+    """Write the velocity of the base link's origin [m/s], world frame, (num_worlds,); one thread per world.
+
+    Newton's joint_qd has the velocity of the link's centre of mass, `body_com` [m] in its frame, instead.
+    """
     world = wp.tid()
     velocity[world] = load_base(joint_q, joint_qd, body_com[world * BODIES], world).lin
 

@@ -22,7 +22,11 @@ class LegSpring:
 
 @wp.func
 def spring_torque(spring: LegSpring, loop: FiveBar) -> vec3:
-    """Return the torques [N m] of a leg's spring on its motors: lateral (0), outer, inner."""
+    """Return the torques [N m] of a leg's spring on its motors: lateral (0), outer, inner.
+
+    They are the spring's force times the knees' velocities per motor rate. Positive opens the thighs: a stretched
+    spring gives negative torques.
+    """
     span = loop.outer_knee - loop.inner_knee
     length = wp.max(wp.length(span), real(1.0e-4))
     pull = spring.stiffness * (spring.length / length - real(1.0)) * span  # [N] on the outer knee

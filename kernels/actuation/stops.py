@@ -14,6 +14,9 @@ torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia
 The pressed stops are found together with contact: a step is solved with a set of pressed stops, and again with
 another one until the set is the one that the resulting rates require (`pressed_stops`). Most steps need one set, few
 three. Friction can make sets cycle, in a violent impact on jammed legs: after `PRESS_ONLY` sets, stops are only added.
+
+Motor angles are lateral (positive outward), outer and inner (positive away from the leg's other thigh). The sum
+outer + inner is the angle between the thighs; its lower stop keeps the knees apart.
 """
 
 import warp as wp
@@ -67,7 +70,11 @@ class StopForces:
 
 @wp.func
 def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
-    """Return the end-of-step motor rates beyond which hard stops exert torque in a step dt [s], from angles [rad]."""
+    """Return the end-of-step motor rates beyond which hard stops exert torque in a step dt [s], from angles [rad].
+
+    They are the module's `goal`, of the rate s away from the lower stop, and minus it for the upper stop, where s is
+    minus the rate.
+    """
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
     outside = real(1.0) / dt
@@ -132,7 +139,8 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
     """Return which hard stops of a leg to assume pressed in the next solution of a step, after `sets` solutions.
 
-    The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s].
+    The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s]. From `PRESS_ONLY` sets on none is released, so that
+    the search ends.
     """
     required = pressed_stops(stop_rates, rates, slack, pressed)
     if required == pressed or sets < PRESS_ONLY:
@@ -146,7 +154,10 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether only one hard stop per world may change in the next solution of a step, after `sets` of them."""
+    """Return whether only one hard stop per world may change in the next solution of a step, after `sets` of them.
+
+    Changing all stops at once is faster, but can cycle; changing one at a time cannot, without friction.
+    """
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
@@ -171,7 +182,11 @@ def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
 
 @wp.func
 def stop_forces(stop_rates: StopRates, rates: vec3, pressed: int, dt: real) -> StopForces:
-    """Return the implicit forces of a leg's pressed hard stops; rates [rad/s]: at the start of the step dt [s]."""
+    """Return the implicit forces of a leg's pressed hard stops; rates [rad/s]: at the start of the step dt [s].
+
+    A pressed stop has the torque c (goal - s), linear in the rates at the end of the step: dt c joins the inertia. The
+    stop of outer + inner acts on both motors alike.
+    """
     forces = StopForces()
     if pressed == 0:
         return forces

@@ -1,4 +1,8 @@
-"""Commands of the attitude task: goal orientations, sampled at random or set from Python (`Env.command`)."""
+"""Commands of the attitude task: goal orientations, sampled at random or set from Python (`Env.command`).
+
+Quaternions are xyzw, body to world; body axes are x ahead, y left, z up. A random number is identified by its index in
+a stream (`streams`), and `fold_in` derives an independent stream.
+"""
 
 import warp as wp
 
@@ -16,7 +20,7 @@ class TurnRanges:
     """Ranges from which the rotation to a goal orientation is sampled, body axes."""
 
     angle: wp.vec2  # [rad] (smallest, largest)
-    body_axis_probability: float  # of an axis +-x, +-y or +-z; else the axis is uniform over the sphere
+    body_axis_probability: float  # of an axis +-x, +-y or +-z, as evaluations use; else uniform over the sphere
 
 
 @wp.func
@@ -58,7 +62,8 @@ def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
 def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
     """Return the task state whose goal is the present orientation rotated by the quaternion `values` (xyzw, body axes).
 
-    values: quaternion of any length; zeros: no rotation. scene and heading are unused (signature of `command.set`).
+    The command is relative, so that it means the same for any start. values: quaternion of any length; zeros: no
+    rotation. scene and heading are unused (signature of `command.set`).
     """
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:

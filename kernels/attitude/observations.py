@@ -1,4 +1,8 @@
-"""Observation terms of turning in free flight."""
+"""Observation terms of turning in free flight, where the robot rotates by moving its legs.
+
+`set_mirror` states how a term changes if the robot is mirrored left to right: column numbers, negative where the sign
+changes.
+"""
 
 import warp as wp
 
@@ -9,14 +13,17 @@ from .state import POLICY_RATE, AttitudeState, rotation_between
 
 @wp.func
 def turn_left(robot: RobotView, state: AttitudeState) -> wp.vec4:
-    """Rotation from the robot's orientation to the goal orientation: quaternion xyzw with w >= 0, body axes."""
+    """Rotation from the robot's orientation to the goal orientation: quaternion xyzw with w >= 0, body axes.
+
+    Both signs of a quaternion are the same rotation; w >= 0 makes it unique.
+    """
     turn = rotation_between(robot.quat, state.goal)
     return wp.vec4(turn[0], turn[1], turn[2], turn[3])
 
 
 @wp.func
 def time_left(robot: RobotView, state: AttitudeState) -> float:
-    """Time until the end of the episode [s]; 0 for an episode without end."""
+    """Time until the end of the episode [s], with which the value of a state changes; 0 for an episode without end."""
     return float(wp.max(state.episode_steps - state.steps, 0)) / POLICY_RATE
 
 

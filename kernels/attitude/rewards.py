@@ -1,4 +1,7 @@
-"""Reward terms of turning in free flight."""
+"""Reward terms of turning in free flight. The sign is in the weights: penalties return positive values.
+
+`state.error` is the angle [rad] of the rotation from the base's orientation to the goal.
+"""
 
 import warp as wp
 
@@ -9,7 +12,10 @@ from .state import POLICY_RATE, AttitudeState
 
 @wp.func
 def approach(robot: RobotView, state: AttitudeState) -> float:
-    """Reward for turning toward the goal orientation: decrease of the angle to it per second [rad/s]."""
+    """Reward for turning toward the goal orientation: decrease of the angle to it per second [rad/s].
+
+    Summed over an episode it is the angle gained, so turning back and forth pays nothing.
+    """
     return (state.old_error - state.error) * POLICY_RATE
 
 
@@ -23,7 +29,8 @@ def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
 def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
     """Reward for rest at the goal orientation: product of Gaussians phi of the angle to it and of the angular speed.
 
-    std [rad], std_ang_vel [rad/s]: their widths.
+    std [rad], std_ang_vel [rad/s]: their widths. The product demands rest only near the goal; far from it, the robot
+    must spin.
     """
     return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
@@ -32,6 +39,7 @@ def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float)
 def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_posture: float) -> float:
     """Reward for the default pose at the goal orientation: product of Gaussians phi of angle and motor offset.
 
+    Legs in the default pose can take a landing; away from the goal they are free to turn the robot.
     std [rad]: width for the angle to the goal orientation; std_posture [rad]: for the rms offset of all motors.
     """
     return phi(state.error, std) * phi(posture_offset(robot, 0.0), std_posture)

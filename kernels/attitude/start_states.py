@@ -1,4 +1,8 @@
-"""Start states of the attitude task: weightless, with a sampled spin, legs sampled or in the default pose."""
+"""Start states of the attitude task: weightless, with a sampled spin, legs sampled or in the default pose.
+
+World z is up; quaternions are xyzw, body to world. Motors of a leg are lateral (positive outward), outer and inner
+(positive away from the leg's other thigh). Joint rates at the start are 0.
+"""
 
 import warp as wp
 
@@ -48,7 +52,8 @@ class AttitudeStart:
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
     """Return a copy of `start` for one sampling attempt; in the last attempt its legs are in the default pose.
 
-    A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
+    The default pose is free of collisions, so that some attempt is valid. A `sample_base` of
+    `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
@@ -83,7 +88,8 @@ def write_start(
 ):
     """Write a weightless start state with orientation `quat` (xyzw, body to world) to world `rng.world`.
 
-    The base origin is at rest above the world's origin while the body spins; `skill` holds the motors' limits.
+    The base origin is at rest above the world's origin while the body spins: the centre of mass, whose velocity Newton
+    stores, moves around it. `skill` holds the motors' limits.
     """
     w = settings.spin
     start = AttitudeStart()

@@ -1,4 +1,7 @@
-"""State of the attitude task (`AttitudeState`), and its update in a policy step."""
+"""State of the attitude task (`AttitudeState`), and its update in a policy step of 1/60 s.
+
+Quaternions are xyzw, body to world; world z is up.
+"""
 
 import warp as wp
 
@@ -48,7 +51,10 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the task state with a new goal; quat, goal: present and goal orientation (xyzw, body to world)."""
+    """Return the task state with a new goal; quat, goal: present and goal orientation (xyzw, body to world).
+
+    `old_error` becomes the new error too, so that a change of the goal is not taken for a motion toward it.
+    """
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
@@ -78,7 +84,8 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 def carried_over(old: AttitudeState) -> AttitudeState:
     """Return a state for a new episode that keeps only the accumulated statistics of `old`, the previous state.
 
-    They include that episode if it was complete. The reset sets the other fields.
+    They include that episode if it was complete: its settling time is that of the first of the steps at its end that
+    were all within tolerance. The reset sets the other fields.
     """
     new = AttitudeState()
     new.episodes = old.episodes
@@ -99,7 +106,7 @@ def carried_over(old: AttitudeState) -> AttitudeState:
 
 @wp.func
 def attitude_error(robot: RobotView, state: AttitudeState) -> float:
-    """Return the angle [rad] of the rotation from the base's orientation to the goal; `robot` is unused."""
+    """Return the curriculum's error: angle [rad] from the base's orientation to the goal; `robot` is unused."""
     return state.error
 
 

@@ -1,4 +1,7 @@
-"""Terminations of the attitude task; `mdp.terminations` has those of all tasks."""
+"""Terminations of the attitude task; `mdp.terminations` has those of all tasks.
+
+The first term of a task that holds ends the episode: `ended_clear`, a success, precedes `ended`.
+"""
 
 import warp as wp
 

@@ -63,7 +63,10 @@ def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
-    """Return a cheap lower bound [m^2] on the squared distance of a segment from a box (`segment_box_sq`)."""
+    """Return a cheap lower bound [m^2] on the squared distance of a segment from a box (`segment_box_sq`).
+
+    It is the distance of the segment's own axis-aligned bounding box; most pairs are far apart and need no more.
+    """
     gap = wp.max(wp.min(start, end) - half, -half - wp.max(start, end))
     gap_outside = wp.max(gap, vec3(real(0.0)))
     return wp.dot(gap_outside, gap_outside)
@@ -73,7 +76,8 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
     """Return the distance [m] of two rounded shapes, at most `bound` [m], from the squared one of their axes or boxes.
 
-    It is min(sqrt(distance_sq [m^2]) - radius, bound); radius: of both shapes together, bound >= 0.
+    It is min(sqrt(distance_sq [m^2]) - radius, bound); radius: of both shapes together, bound >= 0. A pair beyond the
+    bound, such as the smallest distance so far, costs no root.
     """
     reach = bound + radius
     if distance_sq >= reach * reach:

@@ -1,4 +1,7 @@
-"""Contacts of the paws as rows of a `newton.Contacts`."""
+"""Contacts of the paws as rows of a `newton.Contacts`, the form in which other Newton code reads contacts.
+
+`SolverJumper` finds contacts itself and solves for impulses per paw; only this file translates them.
+"""
 
 import warp as wp
 
@@ -45,8 +48,9 @@ def paw_contacts_kernel(
 ):
     """Write every paw's contact with the ground, touching or not, to a row of a `newton.Contacts`.
 
-    Shape 0 is the paw, shape 1 the ground; launch over (4, num_worlds). force: of the ground on each paw [N], world,
-    (4, num_worlds). contact_f: force [N] and torque [N m] on the paw, world. A block counts as ground.
+    Row 4 world + leg always belongs to the same paw, so that threads need no shared counter. Shape 0 is the paw, shape
+    1 the ground; launch over (4, num_worlds). force: of the ground on each paw [N], world, (4, num_worlds). contact_f:
+    force [N] and torque [N m] on the paw, world. A block counts as ground.
     """
     leg, world = wp.tid()
     row = 4 * world + leg

@@ -2,8 +2,9 @@
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
-along the lateral axes, and the shell is four boxes. Distances between links are computed in the body frame. Every
-distance is signed: positive apart, negative where the shapes overlap.
+along the lateral axes, and the shell is four boxes. Distances between links are computed in the body frame (x ahead, y
+left, z up). Every distance is signed: positive apart, negative where the shapes overlap. Legs are 0 to 3: FL, FR, BL,
+BR. `bound` [m]: distance beyond which a pair does not matter, which saves most of the work.
 
 Pairs that the mechanism keeps apart or together at any joint angle are not checked: a leg with its own housing and
 with the motor drums at its own end of the body, around whose axis it turns at a fixed distance; thighs with the shanks
@@ -99,7 +100,8 @@ def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> L
 def capsule_end(k: int) -> int:
     """Return the row of `LegCapsules.ends` that holds the far end of link k; the near end is in row k.
 
-    Links as in `capsule_radius`.
+    Thighs (0, 1) end in the knees (rows 2, 3), shanks (2, 3) in the ankle (row 4), and the paw (4) begins and ends
+    there.
     """
     return wp.min(k + 2, 4)
 
@@ -155,7 +157,10 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
 
 @wp.func
 def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] of a leg from the shell without the motor drums at its end of the body, up to `bound`."""
+    """Return the distance [m] of a leg from the shell without the motor drums at its end of the body, up to `bound`.
+
+    The leg turns around these drums at a fixed distance. Boxes: 0 nose to tail, 1 trunk, 2 front drums, 3 rear drums.
+    """
     drums = wp.where(capsules.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))
@@ -163,7 +168,10 @@ def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
 
 @wp.func
 def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> real:
-    """Return the smallest distance [m] between thighs, shanks and paws of two legs, at most `bound` (>= 0) [m]."""
+    """Return the smallest distance [m] between thighs, shanks and paws of two legs, at most `bound` (>= 0) [m].
+
+    The legs' bounding boxes are compared first; only if these are close, all 25 pairs of links are.
+    """
     gap = wp.max(wp.max(neighbour.low - leg.high, leg.low - neighbour.high), vec3(real(0.0)))
     reach = bound + leg.paw_radius + neighbour.paw_radius
     nearest = bound
@@ -247,7 +255,10 @@ def load_leg(
 
 @wp.func
 def next_leg(order: int) -> int:
-    """Return the index of the leg at position `order` (modulo 4) around the body: FL, FR, BR, BL are 0, 1, 3, 2."""
+    """Return the index of the leg at position `order` (modulo 4) around the body: FL, FR, BR, BL are 0, 1, 3, 2.
+
+    Each leg is compared with the next one around the body; diagonal legs are not compared.
+    """
     return (order % 4) ^ ((order % 4) >> 1)
 
 
@@ -258,7 +269,8 @@ def add_leg_distances(
 ) -> Collisions:  # fmt: skip
     """Return `collisions` updated by one leg's distances to the ground, itself, the shell and the leg `neighbour`.
 
-    pos [m], rotation: see `leg_ground_distances`. min_distance [m]: links closer than this to another link raise flags.
+    pos [m], rotation: see `leg_ground_distances`. min_distance [m]: links closer than this to another link raise flags;
+    the ground has no such margin.
     """
     zero = real(0.0)
     over_ground = leg_ground_distances(ground, leg, pos, rotation)
@@ -305,8 +317,9 @@ def leg_collisions(
 ) -> int:  # fmt: skip
     """Return the flags of the forbidden contacts of one leg, at position `order` (0 to 3) around the body.
 
-    The union over all four orders equals the flags of `world_collisions` if min_distance is 0. min_distance [m]: links
-    closer than this to another link raise flags.
+    For kernels with a thread per leg. Order 0 also checks the shell against the ground. The union over all four orders
+    equals the flags of `world_collisions` if min_distance is 0. min_distance [m]: links closer than this to another
+    link raise flags.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(

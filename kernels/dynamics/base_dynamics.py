@@ -1,6 +1,12 @@
 """Solution of the equations of motion, a block arrowhead system: eliminate legs, solve for the base, substitute back.
 
-Equations and symbols (D, Bv, Bw, tau, h): see `leg_dynamics`. All vectors are in body axes.
+Legs interact through the base alone. With the base's linear and angular acceleration a, alpha, a leg's motor
+accelerations q'' (lateral, outer, inner) and torques tau, and its inertia D, couplings Bv, Bw and bias torques h,
+
+    D q'' + Bv^T a + Bw^T alpha + h = tau      gives      q'' = D^-1 (tau - h) - D^-1 Bv^T a - D^-1 Bw^T alpha,
+
+which turns the equations of base and four legs (18) into six for the base: small fixed-size matrices, no large system.
+All vectors are in body axes, about the base origin. See `leg_dynamics` for the terms.
 """
 
 import warp as wp
@@ -48,7 +54,8 @@ class BaseInverse:
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
     """Solve a leg's equations of motion for its motor accelerations, as a linear function of the base's acceleration.
 
-    implicit: matrix added to D [kg m^2]; torque: tau [N m], motor space.
+    implicit: matrix added to D [kg m^2], of armature and of forces that are implicit in time; torque: tau [N m], motor
+    space.
     """
     solve = LegSolve()
     inverse = inverse_symmetric(leg.inertia + implicit)
@@ -64,7 +71,8 @@ def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, momen
     """Return the equations of motion of the base link alone, without the legs.
 
     omega: angular velocity [rad/s]; g: gravity [m/s^2]; force [N], moment [N m] about the origin: external; all in body
-    axes.
+    axes. force and moment of the result are all that accelerates the base: external, weight, and minus the
+    velocity-product (gyroscopic) terms.
     """
     system = BaseSystem()
     system.lin = wp.diag(vec3(body.mass))
@@ -77,7 +85,12 @@ def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, momen
 
 @wp.func
 def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem:
-    """Return the base's equations of motion (`system`) plus the terms of one leg, its motors eliminated (`solve`)."""
+    """Return the base's equations of motion (`system`) plus the terms of one leg, its motors eliminated (`solve`).
+
+    At fixed motor angles the leg adds its mass and inertia to the base. Its motors yield: replacing q'' in the leg's
+    force on the base, Bv q'' + bias, subtracts Bv D^-1 Bv^T (a Schur complement) from the inertia, and moves the leg's
+    forces, bias and Bv D^-1 (tau - h), to the right side with a minus sign.
+    """
     s = BaseSystem()
     s.lin = system.lin + wp.diag(vec3(leg.body.mass)) - leg.coupling_lin * solve.to_lin
     s.cross = system.cross - skew(leg.body.first) - leg.coupling_lin * solve.to_ang
@@ -121,7 +134,10 @@ def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
 
 @wp.func
 def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
-    """Return the motor accelerations [rad/s^2] of a leg for base accelerations [m/s^2], [rad/s^2] in body axes."""
+    """Return the motor accelerations [rad/s^2] of a leg for base accelerations [m/s^2], [rad/s^2] in body axes.
+
+    It substitutes the base's solution back into the leg's eliminated equations.
+    """
     return solve.free - solve.to_lin * lin - solve.to_ang * ang
 
 

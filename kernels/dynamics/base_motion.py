@@ -1,4 +1,8 @@
-"""Rigid motion of the base: integration of its pose, and wrenches moved to its origin."""
+"""Rigid motion of the base: integration of its pose, and wrenches moved to its origin.
+
+The equations of motion are about the base link's origin in body axes (x ahead, y left, z up); Newton's wrenches act at
+its centre of mass, in world axes. Quaternions are xyzw, body to world.
+"""
 
 import warp as wp
 
@@ -41,7 +45,11 @@ def exp_rotation(rotation_vector: vec3) -> quat:
 
 @wp.func
 def integrate_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
-    """Return the base state integrated over dt [s] with the twist at its end; lin [m/s], ang [rad/s]: old body axes."""
+    """Return the base state integrated over dt [s] with the twist at its end; lin [m/s], ang [rad/s]: old body axes.
+
+    Velocities are updated first and move the pose (semi-implicit Euler). ang keeps its components: they are the same in
+    old and new body axes, since the turn is about ang itself.
+    """
     moved = BaseState()
     moved.lin = wp.quat_rotate(base.quat, lin)
     moved.ang = ang

@@ -5,12 +5,13 @@ At the end of a step each paw satisfies, with v the velocity of its contact poin
     0 <= p_n  complementary to  v_n - v_free >= 0,      |p_t| <= mu p_n,
     p_t = -mu p_n v_t / |v_t|  where the paw slides,    v_t = 0 where it sticks,
 
-v_free = -gap / dt closes an open gap exactly. The four paws are coupled through the base alone,
+v_free = -gap / dt closes an open gap exactly (code: `goal`). The four paws are coupled through the base alone,
 
     v_k = v_k0 + A_k p_k + G_k (change of base twist),   change of base twist = S^-1 sum_k G_k^T p_k,
 
-so block Gauss-Seidel over the paws, each solved exactly as a 3x3 problem, converges quickly. Vectors are in body axes.
-Pressed hard stops are part of A and S (see `world_step`).
+with S the base's inertia with legs (6x6), so block Gauss-Seidel over the paws, each solved exactly as a 3x3 problem,
+converges quickly. Vectors are in body axes. Impulses [N s] act from the ground on the paw; normals point out of the
+ground, so that a positive normal velocity separates. Pressed hard stops are part of A and S (see `world_step`).
 
 Velocities of paws that touch a sliding block are relative to it. The block obeys friction with the floor exactly, at
 every stage of the iteration: its velocity is a function of the impulses (`block_velocity`), so that paws and block
@@ -252,7 +253,8 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
     """Return `contact` as one with the sliding block, which also moves under the paw's impulse.
 
-    `on_block` is set to 1, and the block's response is added to `total`.
+    `on_block` is set to 1, and the block's response is added to `total`: it slides along the floor only, so that the
+    vertical direction is taken out.
     """
     c = contact
     c.on_block = 1
@@ -323,7 +325,8 @@ def solve_contacts(
 def contact_mode(impulse: vec3, normal: vec3, mu: real) -> int:
     """Classify a paw's solved contact as SEPARATE, STICK or SLIDE from its impulse [N s].
 
-    normal: unit, out of the ground; mu: friction coefficient.
+    normal: unit, out of the ground; mu: friction coefficient. Impulses within 1e-4 of the cone count as sliding, as
+    rounding leaves solved ones on either side of it.
     """
     size = wp.dot(impulse, normal)
     if size <= real(0.0):

@@ -1,4 +1,9 @@
-"""Contact laws of the paws at the solution of a step, and their derivatives for the reverse pass."""
+"""Contact laws of the paws at the solution of a step, and their derivatives for the reverse pass.
+
+The forward pass solves for impulses p and contact velocities v by iteration. The reverse pass differentiates the
+equation R(p, v) = 0 that they satisfy, in the mode that was found: separated, sticking or sliding (`contact_residual`).
+Vectors are in body axes; normals n point out of the ground, impulses act on the paw. Paws k are 0 to 3: FL, FR, BL, BR.
+"""
 
 import warp as wp
 
@@ -33,7 +38,7 @@ def contact_at(
 ) -> PawContact:
     """Return the contact of paw k with the floor at the solution of a step, with velocity responses to impulses.
 
-    k: 0 to 3. impulse [N s]: body axes.
+    k: 0 to 3. impulse [N s]: body axes. Recomputed from the state at the start of the step, instead of stored.
     """
     contact = PawContact()
     contact.active = 1
@@ -57,6 +62,7 @@ def paw_law(
 ) -> PawLaw:
     """Return the contact law of paw k (0 to 3), linearised at the solution of a step.
 
+    The matrices are the derivatives of `contact_residual` in its mode; SEPARATE needs none, since p = 0.
     old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
     preceding step; all in body axes.
     """

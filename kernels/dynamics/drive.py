@@ -1,4 +1,8 @@
-"""Inputs of the physics kernels (motor targets, forces), and arrays of their results in every world."""
+"""Inputs of the physics kernels (motor targets, forces), and arrays of their results in every world.
+
+Motors are 3 * leg + j: legs FL, FR, BL, BR; j lateral, outer, inner. One launch makes several physics steps of a policy
+step: the motors' feedback acts in each, and `delay` steps pass before a new target arrives (latency).
+"""
 
 import warp as wp
 
@@ -58,7 +62,10 @@ class Workspace:
 def freeze_diverged_world(
     model: RobotModel, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ):
-    """Put a diverged world at rest in its reference pose, without contact forces, and reset its block."""
+    """Put a diverged world at rest in its reference pose, without contact forces, and reset its block.
+
+    So Newton's arrays contain no NaN. The world stays in that pose until it is reset (`Workspace.diverged`).
+    """
     rest_block(model.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]

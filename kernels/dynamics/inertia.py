@@ -1,7 +1,11 @@
 """Mass properties: zeroth, first and second moments of a mass distribution.
 
 Packed second moments are S = integral of r r^T dm [kg m^2] about a stated point, as (xx, yy, zz, xy, xz, yz). Moments
-of several links about one point add up; the inertia tensor is trace(S) 1 - S.
+of several links about one point add up; the inertia tensor is trace(S) 1 - S. S turns with its
+links as r r^T does, which makes its rotations and derivatives short.
+
+Angles of rotation are given as cosine c and sine s, which the kinematics have already; -s inverts a rotation. Vectors
+and derivatives in the plane of a leg (xz) are stored without their y, which is 0.
 """
 
 import warp as wp
@@ -135,7 +139,10 @@ def symmetric(xx: real, xy: real, xz: real, yy: real, yz: real, zz: real) -> mat
 
 @wp.func
 def inverse_symmetric(m: mat33) -> mat33:
-    """Return the inverse of a symmetric matrix, zero for a singular one; only the upper triangle is read."""
+    """Return the inverse of a symmetric matrix, by cofactors; only the upper triangle is read.
+
+    It is zero for a singular one, so that a body without inertia causes no division by 0.
+    """
     xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
     xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
     xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]

@@ -6,7 +6,10 @@ With the base's linear acceleration a (of its origin), angular one alpha, and mo
     force on the base origin  = m a - first x alpha + Bv q'' + F
     moment about it           = first x a + I alpha + Bw q'' + N
 
-All vectors are in body axes, about the base origin; m, first, I: the leg's mass moments and inertia tensor.
+All vectors are in body axes, about the base origin; m, first, I: the leg's mass moments and inertia tensor. Motors are
+lateral, outer, inner; the housing turns by side * lateral about body x (side: +1 left, -1 right), so that a positive
+lateral angle swings the paw outward. Gravity g enters as the acceleration -g of the hip. The "plane" is the five-bar's,
+housing x and z; housing axes are body axes turned by the lateral motor.
 """
 
 import warp as wp
@@ -112,7 +115,10 @@ def centrifugal(second_j: vec5, w: vec3) -> real:
 
 @wp.func
 def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> MassMoments:
-    """Return a leg's mass and its moments of mass about the base origin, body axes; cosine, sine: see `LegPose`."""
+    """Return a leg's mass and its moments of mass about the base origin, body axes; cosine, sine: see `LegPose`.
+
+    The sums are about the hip in housing axes: they are turned to body axes, then shifted by the hip's position.
+    """
     first = rotate_x(sums.first, cosine, sine)
     body = MassMoments()
     body.mass = sums.mass
@@ -127,7 +133,11 @@ def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Mass
 
 @wp.func
 def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
-    """Return a leg's inertia and its couplings to the base, with zero bias forces; cosine, sine: see `LegPose`."""
+    """Return a leg's inertia and its couplings to the base, with zero bias forces; cosine, sine: see `LegPose`.
+
+    A column of the couplings is the leg's linear and angular momentum about the base origin at a unit rate of one motor
+    (l, o, i: lateral, outer, inner).
+    """
     leg = LegDynamics()
     second = sums.second
     lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
@@ -156,7 +166,9 @@ def assemble_leg(
     """Return a leg's inertia, couplings to the base and bias forces from the mass integrals of its links.
 
     rates: motor rates [rad/s]; omega: base angular velocity [rad/s], g: gravity [m/s^2], both in body axes; cosine,
-    sine: see `LegPose`.
+    sine: see `LegPose`. Bias forces are those of the leg's motion while all accelerations (a, alpha, q'') are zero:
+    computed in the housing frame, which turns with w and still has an acceleration of rotation w_acc, then turned to
+    body axes.
     """
     zero = real(0.0)
     lateral_rate = geo.side * rates[0]

@@ -5,6 +5,10 @@ r_o, r_i with respect to the outer and inner motor angle. From them follow the l
 Lagrange's equations, every inertial coupling and velocity-product force (`leg_dynamics`).
 
 The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are stored as (x, z).
+Housing axes are body axes (x ahead, y left, z up) turned about x by the lateral motor. Links rotate about housing +y, 0
+for a link that hangs along -z. A positive motor angle moves a thigh away from the other one: with `front` +1 for a
+front leg and -1 for a back leg, it turns an outer thigh by -front * angle, an inner one by front * angle. `link.first`
+and `link.second` are in the link's own frame; u and s are the same moments in housing axes.
 """
 
 import warp as wp
@@ -174,7 +178,10 @@ def add_thigh(
 
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of outer thigh and shank together; subscripts: o is the outer motor, i the inner."""
+    """Return the mass integrals of outer thigh and shank together; subscripts: o is the outer motor, i the inner.
+
+    The outer motor moves both; the inner one moves only the shank, through the ankle of the closed loop.
+    """
     sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
     shank_part = shank_sums(
@@ -187,7 +194,10 @@ def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of inner thigh and shank together; subscripts: o is the inner motor, i the outer."""
+    """Return the mass integrals of inner thigh and shank together; subscripts: o is the inner motor, i the outer.
+
+    The inner motor moves both; the outer one moves only the shank, through the ankle of the closed loop.
+    """
     sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
     shank_part = shank_sums(
@@ -202,7 +212,8 @@ def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
     """Return the mass integrals of a whole leg; subscripts: o is the outer motor, i the inner.
 
-    The housing, at rest in its own frame, has only mass and moments.
+    The housing, at rest in its own frame, has only mass and moments. In `inner` o and i are swapped (`LinkSums`), and
+    the sign of its Coriolis term with them.
     """
     c = LinkSums()
     c.mass = housing.mass + outer.mass + inner.mass

@@ -65,7 +65,8 @@ def base_with_momentum(base: BaseState, momentum: RobotMomentum, lin: vec3, ang:
     """Return the base state with its twist corrected so that the robot's momentum becomes lin, ang (world axes).
 
     momentum: that of the robot before the correction. lin [kg m/s], ang [kg m^2/s] about the robot's centre of mass;
-    the rates of the motors stay unchanged.
+    the rates of the motors stay unchanged. With locked joints the robot is one rigid body: the angular velocity changes
+    by the missing angular momentum over its inertia, then the linear velocity by what the centre of mass lacks.
     """
     mass = momentum.body.mass
     com = momentum.body.first / mass

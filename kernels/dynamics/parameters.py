@@ -1,5 +1,7 @@
 """Robot parameters of all worlds in a table: functions that read it, and kernels that fill it from Newton's model.
 
+The physics kernels read the table instead of Newton's arrays: it holds the form that the equations use (moments about a
+link's frame instead of mass, com and inertia), in an order in which neighbouring GPU threads read neighbouring numbers.
 The table is (PARAMETER_ROWS, num_worlds), see `layout`. `load_*` return structs for leg 0 to 3 (FL, FR, BL, BR) of a
 world; units are those of the structs.
 """
@@ -92,7 +94,8 @@ def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSprin
 def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float, com: wp.vec3, inertia: wp.mat33):
     """Write a link's mass moments about its frame's origin to the parameter table.
 
-    From mass [kg], com [m] and inertia at the com [kg m^2]; rows from `row` on.
+    From mass [kg], com c [m] and inertia I at the com [kg m^2]; rows from `row` on. The second moments are
+    S = trace(I) / 2 - I + mass c c^T.
     """
     half_trace = real(0.5) * (real(inertia[0, 0]) + real(inertia[1, 1]) + real(inertia[2, 2]))
     m = real(mass)

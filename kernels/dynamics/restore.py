@@ -1,4 +1,7 @@
-"""Reset of masked worlds to their initial state; masks have shape (num_worlds,)."""
+"""Reset of masked worlds to their initial state; masks have shape (num_worlds,).
+
+A launch covers all worlds, of which those with a false mask stay unchanged: the host need not know which are reset.
+"""
 
 import warp as wp
 
@@ -91,7 +94,10 @@ def mask_kernel(
     # out
     chosen: wp.array(dtype=wp.bool),
 ):
-    """Convert a float mask of worlds to bool (true where it is not 0); one thread per world."""
+    """Convert a float mask of worlds to bool (true where it is not 0), the type that Newton's solvers take.
+
+    One thread per world.
+    """
     world = wp.tid()
     chosen[world] = mask[world] != 0.0
 
@@ -105,7 +111,10 @@ def clear_contact_kernel(
     contact_force: wp.array2d(dtype=wp.vec3),
     diverged: wp.array(dtype=int),
 ):
-    """Zero impulses and contact forces (4, num_worlds) and divergence flags of masked worlds; one thread per world."""
+    """Zero impulses and contact forces (4, num_worlds) and divergence flags of masked worlds; one thread per world.
+
+    Impulses are the contact solver's first guess, which a reset must not take from the earlier motion.
+    """
     world = wp.tid()
     if mask[world]:
         diverged[world] = 0

@@ -1,7 +1,9 @@
 """Parts of a physics step that CPU (`advance`) and GPU (`advance_legs`) share: equations of leg and base, contact.
 
 Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
-its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
+its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR); vectors of motors are lateral, outer, inner. Body axes are x
+ahead, y left, z up, those at the start of the step; quaternions are xyzw, body to world. Normals point out of the
+ground, impulses act on the paw.
 """
 
 import warp as wp
@@ -118,7 +120,10 @@ class Touch:
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the constants of a sliding block's motion in a step dt [s], body axes; zero in a world without one."""
+    """Return the constants of a sliding block's motion in a step dt [s], body axes; zero in a world without one.
+
+    The contact laws of the paws, which may push it, are in body axes too. `weight` is m g dt, an impulse.
+    """
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]
@@ -217,7 +222,10 @@ def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: 
 
 @wp.func
 def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return `inverse`, or zeros if the world's base is held (suspended), so that it cannot accelerate."""
+    """Return `inverse`, or zeros if the world's base is held (suspended), so that it cannot accelerate.
+
+    A base with zero inverse inertia is infinitely heavy; its legs still move.
+    """
     if model.held.shape[0] > 0:
         if model.held[world] != 0:
             return BaseInverse()
@@ -226,7 +234,7 @@ def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInvers
 
 @wp.func
 def finite_base(base: BaseState) -> bool:
-    """Return whether all values of a base state are finite."""
+    """Return whether all values of a base state are finite; a sum that contains NaN or infinity is not."""
     q = base.quat
     total = wp.dot(base.pos, base.pos) + wp.dot(base.lin, base.lin) + wp.dot(base.ang, base.ang)
     return wp.isfinite(total + q[0] + q[1] + q[2] + q[3])

@@ -1,4 +1,8 @@
-"""Sampling of the ground of an episode: level, with a platform to jump off, or with a block to jump onto."""
+"""Sampling of the ground of an episode: level, with a platform to jump off, or with a block to jump onto.
+
+Policies thus learn landings below and above their start. Lengths are in world axes, z up; the start is above the
+origin. The paws of start and goal must not stand on an edge.
+"""
 
 import warp as wp
 
@@ -32,7 +36,7 @@ class GroundRanges:
 def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
     """Return half the length and width [m], along world x, y, of a box around the paws in the widest stance.
 
-    heading [rad]: yaw of the stance.
+    heading [rad]: yaw of the stance. Blocks are aligned with the world's axes, so the box is too.
     """
     half_length = wp.max(wp.max(ranges.front_x[1], ranges.back_x[1]), DEFAULT_PAWS[0])
     half_width = wp.max(wp.max(ranges.front_y[1], ranges.back_y[1]), DEFAULT_PAWS[1])

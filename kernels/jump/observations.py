@@ -1,4 +1,10 @@
-"""Observation terms of jumps: measurable terms for actor and critic, and terms for the critic alone."""
+"""Observation terms of jumps: measurable terms for actor and critic, and terms for the critic alone.
+
+Horizontal vectors are in heading axes (ahead, to the left), so that a jump looks the same in every direction. World z
+is up. `state.goal` is (x, y of the landing, base height at the apex), world. A critic with more information, such as
+the jump's phase, learns faster. `set_mirror` states how a term changes if the robot is mirrored left to right: column
+numbers, negative where the sign changes. `SIGHT_RANGE` is clamped to, so that the network's input stays bounded.
+"""
 
 import warp as wp
 
@@ -27,7 +33,10 @@ def jump_command(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def goal(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Horizontal vector from base to goal [m], ahead and to the left in the base's heading; 0 before the command."""
+    """Horizontal vector from base to goal [m], ahead and to the left in the base's heading; 0 before the command.
+
+    A hidden goal makes robots wait for the command.
+    """
     offset = wp.vec3(0.0)
     if state.steps >= state.command_step:
         offset = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
@@ -36,7 +45,7 @@ def goal(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def phase(robot: RobotView, state: JumpState) -> wp.vec3:
-    """Phase of the jump as a one-hot vector: stance, flight, landed."""
+    """Phase of the jump as a one-hot vector: stance, flight, landed. For the critic: rewards depend on the phase."""
     return wp.vec3(
         wp.where(state.phase == 0, 1.0, 0.0), wp.where(state.phase == 1, 1.0, 0.0), wp.where(state.phase == 2, 1.0, 0.0)
     )
@@ -75,7 +84,10 @@ def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def way(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Horizontal vector from base to goal [m], ahead and to the left in the base's heading, in every phase."""
+    """Horizontal vector from base to goal [m], ahead and to the left in the base's heading, in every phase.
+
+    Unlike `goal` it is known before the command.
+    """
     offset = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(offset[0], offset[1])
 

@@ -1,7 +1,9 @@
 """Reward and termination terms of jumps as in the paper (Table IV), where this project's own tasks use other ones.
 
 phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_*, scale_*: their widths, in the unit of their argument.
-The deceleration along the base's present velocity is the paper's; the stock terms use its velocity before the step.
+The deceleration along the base's present velocity is the paper's; the stock terms use its velocity before the step,
+since plastic contact stops the base within a step. Terms return rewards; a task's weight gives their size. A ballistic
+apex or landing is where the base would go without further forces: it rewards a good takeoff at once.
 """
 
 import warp as wp
@@ -93,13 +95,20 @@ def landed_posture(robot: RobotView, state: JumpState, std: float, shift: float)
 
 @wp.func
 def impact_acceleration(robot: RobotView) -> float:
-    """Return minus the base's deceleration along its velocity [m/s^2], mean of the policy step; 0 if it speeds up."""
+    """Return minus the base's deceleration along its velocity [m/s^2], mean of the policy step; 0 if it speeds up.
+
+    The result is never positive: -49 means that the base is slowed by 5 g.
+    """
     return wp.min(wp.dot(robot.lin_acc, wp.normalize(robot.lin_vel)), 0.0)
 
 
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - deceleration / limit [m/s^2])."""
+    """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - deceleration / limit [m/s^2]).
+
+    It is 1 without deceleration, and 0 from the limit on. The plus sign below is due to the sign of
+    `impact_acceleration`, which is minus the deceleration.
+    """
     if not just_landed(state):
         return 0.0
     return wp.max(0.0, 1.0 + impact_acceleration(robot) / limit)
@@ -107,7 +116,10 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
-    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases."""
+    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases.
+
+    `impact_acceleration` is minus the deceleration.
+    """
     return impact_acceleration(robot) < -wp.where(state.phase == STANCE, stance, flight)
 
 

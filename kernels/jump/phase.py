@@ -1,4 +1,8 @@
-"""Phase machine of a jump (stance, flight, landed), and ballistic estimates of its apex and landing."""
+"""Phase machine of a jump (stance, flight, landed), and ballistic estimates of its apex and landing.
+
+World z is up. The base is taken for a projectile under gravity g, so that a takeoff can be judged before the jump ends.
+`state.goal` is (x, y of the landing, base height at the apex), world.
+"""
 
 import warp as wp
 

@@ -1,7 +1,9 @@
 """Start of jumps: of the first one at a reset (`reset_jump`), and of further ones within an episode.
 
 They are functions of all jump tasks. They sample start mode, goal, ground and time of the command; `start_states`
-samples the state of the robot.
+samples the state of the robot. An episode begins above the origin, in any part of a jump (the start mode), so that
+late parts are learnt before early ones succeed. World z is up; a heading is a yaw [rad]. Random numbers are identified
+by their index in a stream (`streams`); policy steps last 1/60 s.
 """
 
 import warp as wp
@@ -93,7 +95,8 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) ->
 def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
     """Return the sampled policy step at which the jump is commanded.
 
-    It is up to `long_wait` with `long_wait_probability`, else up to `command_delay`.
+    It is up to `long_wait` with `long_wait_probability`, else up to `command_delay`. A varying delay makes the robot
+    wait for the command. One random number u selects the case and, rescaled to [0, 1), the step within it.
     """
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     probability = ranges.long_wait_probability
@@ -109,7 +112,8 @@ def begin_jump(
 ) -> JumpState:  # fmt: skip
     """Return the task state of a new episode: phase of the jump and time of its command, according to the start mode.
 
-    goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base.
+    goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base. An episode that begins after
+    the apex is given the commanded height as its apex, since its own cannot be known.
     """
     state = JumpState()
     state.start_mode = start_mode
@@ -185,7 +189,8 @@ def reset_jump(
 ) -> JumpState:  # fmt: skip
     """Write a start state of a jump to world `rng.world` (`write_start`), and return the state of its new episode.
 
-    old: state of the previous episode, whose policy steps count toward its start mode.
+    old: state of the previous episode, whose policy steps count toward its start mode: modes can be balanced by
+    steps (`ResetRanges.by_steps`), as episodes that begin late are short. skill: has the motors' limits.
     """
     world = rng.world
     ranges = settings.states
@@ -227,8 +232,8 @@ def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpL
 def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
     """Return the state with a jump commanded by the host if the robot is at the start or has landed; else `state`.
 
-    values: goal x, y [m] relative to base and heading [rad], base height at the apex [m], and, at the start only, the
-    policy step of the command.
+    A command at any other time, as in flight, is ignored. values: goal x, y [m] relative to base and heading [rad],
+    base height at the apex [m], and, at the start only, the policy step of the command.
     """
     here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
@@ -248,5 +253,8 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
 
 @wp.func
 def from_standing(state: JumpState) -> bool:
-    """Return whether the episode began standing or in the default pose, and so counts for the curriculum."""
+    """Return whether the episode began standing or in the default pose, and so counts for the curriculum.
+
+    Other episodes begin in the middle of a jump, whose success is partly given.
+    """
     return state.start_mode <= DEFAULT

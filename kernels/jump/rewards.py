@@ -1,9 +1,15 @@
 """Reward terms of jumps (paper, Tables II and IV), as functions of the robot's state, the jump's state and parameters.
 
 Penalties have negative weights in the tasks, unless their values are negative. Times are counted in policy steps of
-1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and scale_*: their widths, in the unit of their
-argument. shift [rad]: added to the default angles of transversal motors. waiting_scale [1]: factor, from the command to
-the takeoff, on rewards that need no jump.
+1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`, exp(-(x / std)^2) and exp(-|x| / scale); std_* and
+scale_*: their widths, in the unit of their argument. shift [rad]: added to the default angles of transversal motors; a
+positive one moves the thighs apart, which lowers the base. waiting_scale [1]: factor, from the command to the takeoff,
+on rewards that need no jump: standing pays less while a jump is due.
+
+World z is up. Motors of a leg are lateral (m % 3 = 0; positive outward) and two transversal ones (positive away from
+the leg's other thigh). Terms after touchdown teach landings in which the base comes to rest over planted paws. Wide
+kernels give bad jumps a slope, narrow ones make good jumps exact. A ballistic apex or landing is where the base would
+go without further forces: it rewards a good takeoff at once.
 """
 
 import warp as wp
@@ -31,7 +37,10 @@ def just_landed(state: JumpState) -> bool:
 
 @wp.func
 def should_rest(state: JumpState) -> bool:
-    """Return whether the robot should stand still: before the jump's command, and from 0.5 s after touchdown."""
+    """Return whether the robot should stand still: before the jump's command, and from 0.5 s after touchdown.
+
+    In between it must move, to jump or to absorb the landing.
+    """
     if state.phase == LANDED:
         return state.phase_steps >= REST_STEPS
     return state.phase == STANCE and not commanded(state)
@@ -237,15 +246,22 @@ def standing_posture(robot: RobotView, state: JumpState, std: float, shift: floa
 
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - base deceleration / limit [m/s^2])."""
+    """Reward for a soft impact, for 0.3 s from touchdown: max(0, 1 - base deceleration / limit [m/s^2]).
+
+    It is 1 without deceleration, and 0 from the limit on.
+    """
     if not just_landed(state):
         return 0.0
-    return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)  # which is at most 0
+    return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)  # base_deceleration is <= 0: minus the deceleration
 
 
 @wp.func
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Penalty of decelerating the base in stance: minus deceleration / limit [m/s^2], clamped to -1..0."""
+    """Penalty of decelerating the base in stance: minus deceleration / limit [m/s^2], clamped to -1..0.
+
+    The value is negative, so its weight is positive. `base_deceleration` is minus the deceleration, <= 0. It keeps a
+    squat from ending abruptly.
+    """
     if state.phase != STANCE:
         return 0.0
     return wp.clamp(base_deceleration(robot) / limit, -1.0, 0.0)
@@ -253,7 +269,10 @@ def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def catch_landing(robot: RobotView, state: JumpState) -> float:
-    """Reward for a base that still moves down, for 0.3 s from touchdown: downward speed [m/s], clamped to 0..1."""
+    """Reward for a base that still moves down, for 0.3 s from touchdown: downward speed [m/s], clamped to 0..1.
+
+    The legs yield to the landing instead of stopping it.
+    """
     if not just_landed(state):
         return 0.0
     return wp.clamp(-robot.lin_vel[2], 0.0, 1.0)
@@ -263,7 +282,7 @@ def catch_landing(robot: RobotView, state: JumpState) -> float:
 def damp_landing(robot: RobotView, state: JumpState) -> float:
     """Reward for legs that fold in the 0.3 s after touchdown: mean rate [rad/s] of the transversal motors.
 
-    Each rate is clamped to 0..1.
+    Each rate is clamped to 0..1: thighs that move apart (positive) lower the base.
     """
     if not just_landed(state):
         return 0.0
@@ -302,7 +321,10 @@ def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Penalty of the base's tilt while it falls in flight: (sin(tilt) / sin(angle))^2; angle [rad]."""
+    """Penalty of the base's tilt while it falls in flight: (sin(tilt) / sin(angle))^2; angle [rad].
+
+    The base must be level before it lands; at takeoff it may pitch.
+    """
     if state.phase != FLIGHT or robot.lin_vel[2] > 0.0:
         return 0.0
     return tilt_over(robot, angle)
@@ -321,7 +343,7 @@ def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
 
 @wp.func
 def paws_down(robot: RobotView, state: JumpState) -> float:
-    """Reward for paws on the ground after touchdown: their number, 0 to 4."""
+    """Reward for paws on the ground after touchdown: their number, 0 to 4. It discourages steps and hops."""
     if state.phase != LANDED:
         return 0.0
     return float(robot.contacts)
@@ -332,7 +354,7 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
     """Reward after touchdown for a capture point (where an inverted pendulum stops) near the middle of the paws.
 
     It is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), with the base's position p,
-    velocity v and height h.
+    velocity v and height h. A robot whose capture point is between its paws comes to rest without another step.
     """
     if state.phase != LANDED:
         return 0.0
@@ -355,7 +377,11 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
-    """Penalty of changes of motor torque while the robot should rest: sum of their squares [N^2 m^2]."""
+    """Penalty of changes of motor torque while the robot should rest: sum of their squares [N^2 m^2].
+
+    The change is that from one policy step to the next, each at its last physics step. The base can rest while
+    motors chatter; this term makes them quiet.
+    """
     if not should_rest(state):
         return 0.0
     return square_sum(robot.torque - robot.prev_torque)
@@ -365,7 +391,8 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
     """Penalty of paw forces that vary within a policy step while the robot should rest.
 
-    It is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2.
+    It is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2; weight_force is
+    the robot's weight. It penalises contact that chatters between two policy steps.
     """
     if not should_rest(state):
         return 0.0

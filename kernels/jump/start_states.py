@@ -2,6 +2,11 @@
 
 If no attempt is valid, the episode begins in the default pose. A jump goes from above the origin to `goal`: x, y [m] of
 the landing and the commanded base height [m] at the apex; if that is 0, the takeoff angle is sampled instead.
+
+Episodes that begin late in a jump let a policy learn the landing before it can take off. World z is up, quaternions
+are xyzw (body to world), heading is a yaw [rad], a positive pitch lowers the nose. Legs are FL, FR, BL, BR; motors are
+lateral (positive outward), outer and inner (positive away from the leg's other thigh). "Sampled" numbers are uniform in
+a range of `ResetRanges` and identified by an index in the random stream (`streams`).
 """
 
 import warp as wp
@@ -118,7 +123,8 @@ def start_mode_at(probability: vec_start_modes, u: float) -> int:
 def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
     """Return the start mode with the largest deficit of policy steps: its wanted number less its number so far.
 
-    The wanted number is the mode's `probability` times all policy steps; the probabilities add up to 1.
+    The wanted number is the mode's `probability` times all policy steps; the probabilities add up to 1. Balanced by
+    episodes instead, modes with short episodes would have too few samples.
     """
     total = float(0.0)
     for i in range(NUM_START_MODES):
@@ -176,7 +182,7 @@ def goal_direction(start: JumpStart) -> wp.vec3:
 def standing_base(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return the sampled base state of a standing start: at rest over paws around the origin.
 
-    A deeper squat may lean farther back (`lean`).
+    A deeper squat may lean farther back (`lean`), from which the farthest jumps start.
     """
     ranges = start.ranges
     lower = start.base_height[0]
@@ -252,7 +258,8 @@ def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
     """Return the base state shortly before touchdown: `flight` moved back by a sampled distance, with the paws ahead.
 
-    flight: base state on the ballistic flight; the paws (`spot`) stay below its position.
+    Paws ahead of the base let the legs brake the horizontal velocity. flight: base state on the ballistic flight; the
+    paws (`spot`) stay below its position.
     """
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
@@ -266,7 +273,8 @@ def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBas
     """Return the base state during push-off, a sampled distance before the base state `takeoff`.
 
     The base moves on a straight line to `takeoff` with a sampled constant acceleration (`push_length`,
-    `push_acceleration`). Its paws are around the origin.
+    `push_acceleration`), so its speed there was sqrt(v^2 - 2 s a), or 0. Its paws are around the origin. Such starts
+    show the policy that pushing off leads to flight.
     """
     base = takeoff
     back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
@@ -305,7 +313,8 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
     """Return sampled motor angles of leg `leg` in flight, with rates 0.
 
     They are marked as reachable if the paw is at least 0.01 m above the ground. They are within 0.03 rad (lateral) or
-    0.1 rad (outer, inner) of a value sampled once for all legs.
+    0.1 rad (outer, inner) of a value sampled once for all legs, as legs in a flight are nearly symmetric. The random
+    indices without `leg` give all legs the same number.
     """
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]

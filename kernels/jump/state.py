@@ -1,4 +1,4 @@
-"""State of one jump (`JumpState`), and quantities derived from it."""
+"""State of one jump (`JumpState`), and quantities derived from it; policy steps last 1/60 s, world z is up."""
 
 import warp as wp
 
@@ -47,11 +47,11 @@ def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
 
 @wp.func
 def commanded(state: JumpState) -> bool:
-    """Return whether a jump is commanded and the robot has not landed yet (the paper's c)."""
+    """Return whether a jump is commanded and the robot has not landed yet (the paper's c, which policies observe)."""
     return state.steps >= state.command_step and state.phase != LANDED
 
 
 @wp.func
 def waiting(state: JumpState) -> bool:
-    """Return whether the robot is still in stance although a jump is commanded."""
+    """Return whether the robot is still in stance although a jump is commanded: preparing it, or idle."""
     return state.phase == STANCE and state.steps >= state.command_step

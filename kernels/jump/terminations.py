@@ -1,4 +1,8 @@
-"""Termination terms of jumps, as functions of robot, jump and parameters; times in policy steps of 1/60 s."""
+"""Termination terms of jumps, as functions of robot, jump and parameters; times in policy steps of 1/60 s.
+
+Apart from `landed_for`, each ends an attempt that has failed or would damage the robot, so that no reward follows and
+training time goes to good jumps. World z is up. `state.goal` is (x, y of the landing, base height at the apex).
+"""
 
 import warp as wp
 
@@ -75,13 +79,16 @@ def left_stance(robot: RobotView, state: JumpState, distance: float) -> bool:
 
 @wp.func
 def slanted_takeoff(robot: RobotView, state: JumpState, speed: float) -> bool:
-    """Terminate at takeoff if the base moves horizontally faster than `speed` [m/s]."""
+    """Terminate at takeoff if the base moves horizontally faster than `speed` [m/s]: a vertical jump would drift."""
     return state.took_off == 1 and wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1])) > speed
 
 
 @wp.func
 def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float) -> bool:
-    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases."""
+    """Terminate if the base's deceleration exceeds a limit [m/s^2]: `stance` in stance, `flight` in later phases.
+
+    `base_deceleration` is minus the deceleration, <= 0.
+    """
     limit = wp.where(state.phase == STANCE, stance, flight)
     return base_deceleration(robot) < -limit
 
@@ -98,5 +105,5 @@ def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float)
 
 @wp.func
 def early_takeoff(robot: RobotView, state: JumpState) -> bool:
-    """Terminate at a takeoff before the command."""
+    """Terminate at a takeoff before the command; else a policy could ignore the command."""
     return state.took_off == 1 and state.steps < state.command_step

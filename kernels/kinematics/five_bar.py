@@ -3,7 +3,11 @@
 All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
 motor angle moves the thigh tip away from the other. The loop constraint (paper, Eq. 1) holds by construction: the
 ankle is the intersection of the two shank circles, on the branch below the knees. Rotation angles of links are about
-housing +y, 0 for a link that hangs along -z.
+housing +y, 0 for a link that hangs along -z. x is ahead, z up. The outer thigh is the one farther from the body's
+middle; f = `LegGeometry.front` (+1 front leg, -1 back leg) mirrors x, so that equal angles give mirrored legs.
+
+Suffixes: _do, _di are derivatives w.r.t. the outer and inner motor angle; _acc of `FiveBarBias` are accelerations at
+zero motor acceleration.
 """
 
 import warp as wp
@@ -60,7 +64,11 @@ def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
 
 @wp.func
 def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
-    """Return the plane vector x with given projections on two unit vectors: a.x = along_a and b.x = along_b."""
+    """Return the plane vector x with given projections on two unit vectors: a.x = along_a and b.x = along_b.
+
+    With a and b along the shanks, x is the ankle's velocity: a rigid shank moves equally fast along itself at both
+    ends, so that the knees' velocities give both projections.
+    """
     det = a[0] * b[1] - a[1] * b[0]
     # the shanks are parallel only where the knees coincide: keep the division finite there
     if wp.abs(det) < real(1.0e-4):
@@ -110,7 +118,11 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
 
 @wp.func
 def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> FiveBarBias:
-    """Return the five-bar's link rates and velocity-product accelerations for the motor rates [rad/s]."""
+    """Return the five-bar's link rates and velocity-product accelerations for the motor rates [rad/s].
+
+    The equations of motion need them, as constant motor rates do not mean constant link rates. The ankle's acceleration
+    along each shank is that of the knee less the shank's centripetal one.
+    """
     f = geo.front
     bias = FiveBarBias()
     outer_knee_vel = outer_rate * loop.outer_knee_do

@@ -1,4 +1,10 @@
-"""Completion of a Newton state from the base and the 12 motors: passive knees, loop joints, poses of all bodies."""
+"""Completion of a Newton state from the base and the 12 motors: passive knees, loop joints, poses of all bodies.
+
+The solver advances only base and motors, which determine the closed loops; viewers and sensors read Newton's complete
+state. Newton closes a leg's loop by a ball joint at the ankle (4 coordinates, 3 rates). Housing axes are body axes (x
+ahead, y left, z up) turned about x by the lateral motor; links rotate about housing +y, 0 for one that hangs along -z.
+`front`: +1 front leg, -1 back leg; `side`: +1 left, -1 right. Quaternions are xyzw, to the world.
+"""
 
 import warp as wp
 
@@ -72,7 +78,10 @@ def store_body(
     frame: Frame, body: int, body_com: wp.array(dtype=wp.vec3), body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
 ):  # fmt: skip
-    """Write a body's world pose, and its velocity at the centre of mass; body: index over all worlds."""
+    """Write a body's world pose, and its velocity at the centre of mass; body: index over all worlds.
+
+    Newton stores the pose of a link's origin, but the velocity of its centre of mass, `body_com` [m] in its frame.
+    """
     com = body_com[body]
     lin = frame.lin + wp.cross(frame.ang, wp.quat_rotate(frame.quat, vec3(real(com[0]), real(com[1]), real(com[2]))))
     body_q[body] = wp.transform(

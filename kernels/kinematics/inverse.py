@@ -9,6 +9,10 @@ both thigh angles, then a compass search around the best point, with the lateral
 residual is within 1 mm of the true least distance, and most often within 1 micrometre.
 
 No gradients are generated for this file; the derivative is the inverse of `leg.leg_jacobian`.
+
+Targets are in body axes (x ahead, y left, z up). Motor angles are lateral (positive outward), outer and inner (positive
+away from the leg's other thigh). Housing axes are body axes turned about x by the lateral motor. `front`: +1 front leg,
+-1 back leg; `side`: +1 left, -1 right.
 """
 
 import warp as wp
@@ -54,7 +58,7 @@ class LegPose:
 def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
     """Return the thigh angles (outer, inner) [rad] clamped to joint limits.
 
-    Where the sum is out of limits, only `inner` is corrected.
+    Where the sum is out of limits, only `inner` is corrected. `outer` is first limited so that some `inner` fits.
     """
     lower = limits.transversal_lower
     upper = limits.transversal_upper
@@ -118,7 +122,10 @@ def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec
 
 @wp.func
 def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
-    """Return the thigh angles [rad], outer and inner, of point (row, col) of a GRID x GRID grid within joint limits."""
+    """Return the thigh angles [rad], outer and inner, of point (row, col) of a GRID x GRID grid within joint limits.
+
+    The range of `inner` depends on `outer`, because their sum is limited too.
+    """
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     along_row = real(row) / real(GRID - 1)

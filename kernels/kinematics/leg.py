@@ -1,7 +1,9 @@
 """Forward kinematics of one leg, its Jacobian and inverse velocity kinematics.
 
 Motor angles and rates are ordered lateral, outer, inner. The ankle is the centre of the paw. A leg's housing turns
-about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward.
+about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward; a positive outer or inner
+angle moves a thigh away from the leg's other thigh. Body axes are x ahead, y left, z up; side: +1 left, -1 right;
+front: +1 front leg, -1 back leg. The five-bar loop is planar: points (x, z) of the housing, at constant y.
 """
 
 import warp as wp
@@ -81,7 +83,10 @@ def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec
 
 @wp.func
 def knee_angles(geo: LegGeometry, loop: FiveBar, outer: real, inner: real) -> vec2:
-    """Return the passive (outer, inner) knee angles [rad] of a loop at motor angles [rad]; positive bends inward."""
+    """Return the passive (outer, inner) knee angles [rad] of a loop at motor angles [rad]; positive bends inward.
+
+    A knee angle is the rotation of the shank less that of the thigh; rotations are about housing +y, from -z.
+    """
     outer_shank = wp.atan2(-loop.outer_shank[0], -loop.outer_shank[1])
     inner_shank = wp.atan2(-loop.inner_shank[0], -loop.inner_shank[1])
     return vec2(outer + geo.front * outer_shank, inner - geo.front * inner_shank)

@@ -1,4 +1,8 @@
-"""Motor targets from the policy's action, and the external push of a policy step."""
+"""Motor targets from the policy's action, and the external push of a policy step.
+
+Motors m are 3 * leg + j: legs FL, FR, BL, BR; j lateral, outer, inner. A policy step (1/60 s) has several physics
+steps. The target of an action arrives at the motors after the world's latency, often within a later physics step.
+"""
 
 import warp as wp
 
@@ -31,7 +35,8 @@ def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vecto
 def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
     """Write the two targets [rad] that motor m follows in this policy step, and the physics step at which it switches.
 
-    step_count: policy steps of the world so far. The latency is `delays.steps` physics steps.
+    step_count: policy steps of the world so far. The latency is `delays.steps` physics steps: `whole` policy steps and
+    a remainder, during which the motor still follows the target before that.
     """
     whole = delays.steps[world] // delays.substeps
     delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]

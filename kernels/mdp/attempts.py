@@ -3,7 +3,8 @@
 Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
 satisfies the leg loops. A sample is rejected if a paw is out of reach within limits or a link collides. On a GPU the 32
 threads of a world are one warp: lane 4 a + l (`RngStream.lane`) samples leg l of attempt a, and all threads reach each
-exchange of `lanes` together. Each thread has coordinates of one world to itself until an attempt is accepted.
+exchange of `lanes` together. Each thread has coordinates of one world to itself until an attempt is accepted. The first
+valid attempt wins in both cases, so that a CPU and a GPU take the same samples. `rng.lanes`: 1 or 32 threads.
 """
 
 from typing import Any
@@ -56,7 +57,11 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 
 @wp.func
 def sync_attempts(rng: RngStream):
-    """Synchronise the threads that sample a world's start state; no effect with one thread per world."""
+    """Synchronise the threads that sample a world's start state; no effect with one thread per world.
+
+    What one thread has written before is visible to all after it, and no thread overwrites what another has yet to
+    read.
+    """
     if rng.lanes > 1:
         sync_lanes()
 

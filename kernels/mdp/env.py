@@ -1,4 +1,9 @@
-"""Episode bookkeeping of all worlds, and the settings of each skill."""
+"""Episode bookkeeping of all worlds, and the settings of each skill.
+
+A world is one robot with its ground. Worlds may run different skills (tasks, such as walking or jumping) at a time;
+kernels of a skill return at once in worlds of another one. A policy step lasts 1/60 s and has several physics steps.
+Host and device exchange flags as arrays, so that a policy step is one captured graph without waiting.
+"""
 
 import warp as wp
 

@@ -1,4 +1,8 @@
-"""Kernel that runs a task's events (changes of robot parameters): at startup, at resets and at intervals."""
+"""Kernel that runs a task's events (changes of robot parameters): at startup, at resets and at intervals.
+
+Events are domain randomisation: masses, friction, gains, latency, pushes. `TermSlot`s (`jumper_warp.tasks.params`) name
+an event's function and the places of its numbers in `p`, so that a number can change without another kernel.
+"""
 
 import warp as wp
 

@@ -1,4 +1,7 @@
-"""Handover of a world from one skill (task) to another; the robot's state does not change."""
+"""Handover of a world from one skill (task) to another, as from walking to jumping; the robot's state does not change.
+
+Each skill has its own policy, motor gains, observations and task state, of which only one is active in a world.
+"""
 
 from typing import Any
 
@@ -21,8 +24,8 @@ def hand_over(
 ):  # fmt: skip
     """Make skill `target` active in a world: set its motor constants, and clear the observation history.
 
-    The request of a task (`Env.request`) is cleared too. The previous actions become the `target` action that yields
-    the present filtered motor targets.
+    The request of a task (`Env.request`) is cleared too. The previous actions, which the policy of `target` observes,
+    become the `target` action that yields the present filtered motor targets: as if it had been active before.
     """
     episode.skill[world] = target
     episode.requested_task[world] = NONE

@@ -2,7 +2,8 @@
 
 A mirror image is a signed permutation. Entry i is the column, counted from 1, from which column i of the mirror image
 comes; it is negative if the sign changes. Lateral angles are positive outward, and transversal angles away from the
-leg's other link, so motors swap sides and keep their signs.
+leg's other link, so motors swap sides and keep their signs. Training can use mirror images too, since the robot is
+symmetric.
 """
 
 from typing import Any

@@ -1,4 +1,8 @@
-"""Record of the first non-finite value of each term of a task (reward, observation, ...), with its world's state."""
+"""Record of the first non-finite value of each term of a task (reward, observation, ...), with its world's state.
+
+Kernels replace NaN by 0 so that training continues; the record lets the host report which term failed, and in which
+state, without checking after every step.
+"""
 
 from typing import Any
 
@@ -39,6 +43,7 @@ def record_non_finite(
 ):  # fmt: skip
     """Store a term's non-finite value with the world's state, unless the term has a record already.
 
+    Many worlds may fail at once: the first to swap its index into `found.world` (compare-and-swap) writes the record.
     raw: (components, num_worlds); term_value: (rewards, num_worlds); states, found_states: task states of the worlds
     and of the records.
     """

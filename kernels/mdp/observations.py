@@ -1,4 +1,9 @@
-"""Observation terms that any task can use: robot state, and randomised robot parameters (`drawn_*`)."""
+"""Observation terms that any task can use: robot state, and randomised robot parameters (`drawn_*`).
+
+`drawn_*` terms, which no sensor measures, are for the critic: they explain differences between worlds that no action
+causes. Units scale them to the order of 1. Body axes are x ahead, y left, z up; motors are 3 * leg + j, legs FL, FR,
+BL, BR, j lateral, outer, inner. `set_mirror` states how a term changes if the robot is mirrored left to right.
+"""
 
 from typing import Any
 

@@ -1,4 +1,9 @@
-"""Observations: evaluate the terms of all groups, then apply latency, noise, clipping, scale and history."""
+"""Observations: evaluate the terms of all groups, then apply latency, noise, clipping, scale and history.
+
+A group is the input of one network (actor, critic). A component is one number of a term. With history a group has the
+last values of a component, its frames, oldest first. An episode that ends is observed twice in a step: before its reset
+(`final`, from which training estimates the value of a truncated episode) and after it (`now`).
+"""
 
 from typing import Any
 
@@ -210,7 +215,7 @@ def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: f
     """Store a new observation value, and return an earlier one, delayed by the world's latency.
 
     column: index in the ring buffer. The delayed value is linear between policy steps. Where an episode or skill
-    begins, the ring is filled with value.
+    begins, the ring is filled with value: values of the last episode must not appear in the next one.
     """
     if m.history_reset == BEGUN:
         for i in range(RING):

@@ -3,7 +3,8 @@
 An event is a function of (parameters, rng, named numbers) that samples parameters of world `rng.world`, relative to the
 nominal values. Its numbers lower and upper bound a uniform distribution. Ranges of friction and latency are absolute
 and hold for the described robot; `*_move`, another robot's value minus the described one, moves them. `rng.lanes`
-threads share loops over motors or links. Motors m are 0 to 11: legs FL, FR, BL, BR; each lateral, outer, inner.
+threads share loops over motors or links. Motors m are 0 to 11: legs FL, FR, BL, BR; each lateral, outer, inner. Sampled
+ratios are stored as well, since nominal gains and limits change with the active skill, and the ratio must remain.
 """
 
 import warp as wp
@@ -124,7 +125,8 @@ def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
 def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
     """Write no-load and cutoff speed of motor m in a world: the active skill's nominal ones times `ratio`.
 
-    Unless both ratios are 1, the cutoff speed is at most 0.95 of the no-load speed.
+    Unless both ratios are 1, the cutoff speed is at most 0.95 of the no-load speed: the torque falls from its peak to 0
+    between them.
     """
     skill = robot.skill[world]
     no_load = robot.nominal_no_load[skill, m] * ratio[0]
@@ -214,7 +216,10 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 @wp.func
 def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: float) -> bool:
-    """Return True with `nominal_probability`: a delay gets its nominal value. Always False if lower is upper."""
+    """Return True with `nominal_probability`: a delay gets its nominal value. Always False if lower is upper.
+
+    A range of one value fixes the delay, as in an evaluation.
+    """
     return lower < upper and uniform(rng, 1, 0.0, 1.0) < nominal_probability
 
 

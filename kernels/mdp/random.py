@@ -1,5 +1,8 @@
 """Counter-based random streams: a number depends on seed, purpose, world, step count, stream and index only.
 
+There is no state to store or advance: any thread can compute any number, in any order, so that results depend neither
+on the device nor on the number of threads.
+
 The index of a number is hashed into the 32 bits of its stream: state = pcg(stream + pcg(index)). Purposes (training,
 tuning, selection, reporting) have disjoint ranges of indices. Two streams s and t of different purposes have the same
 state for number i only if s - t = pcg(index of i for t) - pcg(index of i for s), modulo 2^32. These differences differ
@@ -59,7 +62,11 @@ def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: in
 
 @wp.func
 def fold_in(rng: RngStream, i: int) -> RngStream:
-    """Return a new random stream that is derived from another and an index, independent for every i."""
+    """Return a new random stream that is derived from another and an index, independent for every i.
+
+    Attempts at a start state, for example, use the same indices in streams of their own. 7919 keeps their
+    seeds apart from the states of the stream's own numbers.
+    """
     branch = rng
     branch.seed = wp.rand_init(int(rng.seed), 7919 + i)
     return branch

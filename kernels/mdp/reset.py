@@ -1,4 +1,8 @@
-"""Resets: new episodes, commands within an episode (sampled or from the host), and the default pose."""
+"""Resets: new episodes, commands within an episode (sampled or from the host), and the default pose.
+
+A launch covers all worlds; `mask` selects those to reset, so that no host decision interrupts a policy step. World z is
+up, a heading is a yaw [rad], quaternions are xyzw (body to world). Motors are 3 * leg + j: lateral, outer, inner.
+"""
 
 from typing import Any
 
@@ -23,7 +27,8 @@ wp.set_module_options({"enable_backward": False})
 def previous_state(old: Any, done: float):
     """Return the previous episode's task state, with `steps` 0 if `Env.reset` interrupted the episode.
 
-    old: its state; done: 0 if it was interrupted.
+    Resets of tasks count an episode with steps in their statistics and levels; an interrupted one is no success or
+    failure. old: its state; done: 0 if it was interrupted.
     """
     state = old
     if done == 0.0:
@@ -136,7 +141,10 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def leg_limits(params: FilterParams) -> LegLimits:
-    """Return the angle limits [rad] of a command filter as `LegLimits` of the inverse kinematics."""
+    """Return the angle limits [rad] of a command filter as `LegLimits` of the inverse kinematics.
+
+    Start states thus lie within the limits that the filter enforces.
+    """
     limits = LegLimits()
     limits.lateral_lower = params.lateral.lower
     limits.lateral_upper = params.lateral.upper
@@ -190,7 +198,10 @@ def advance_rng_kernel(
     # in, out
     episode: EpisodeArrays,
 ):
-    """Increment the step count of worlds with mask != 0, which renews their random streams; one thread per world."""
+    """Increment the step count of worlds with mask != 0, which renews their random streams; one thread per world.
+
+    Without a policy step in between, two resets would otherwise sample the same start.
+    """
     world = wp.tid()
     if mask[world] != 0.0:
         episode.step_count[world] = episode.step_count[world] + 1

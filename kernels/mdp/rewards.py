@@ -1,4 +1,9 @@
-"""Reward terms that any task can use, as functions of the robot's state, the task's state and parameters."""
+"""Reward terms that any task can use, as functions of the robot's state, the task's state and parameters.
+
+Penalties return positive values: their weights in the tasks are negative. Vectors of 12 are motors 3 * leg + j: legs
+FL, FR, BL, BR; j lateral (m % 3 = 0), outer, inner (the transversal ones). World z is up. Penalties of torque,
+acceleration and changing actions give motions that a real robot's motors can follow.
+"""
 
 from typing import Any
 
@@ -57,7 +62,10 @@ def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
 
 @wp.func
 def action_clip(robot: RobotView, state: Any) -> float:
-    """Penalty of actions that the command filter changes: sum of squared changes of motor targets [rad^2]."""
+    """Penalty of actions that the command filter changes: sum of squared changes of motor targets [rad^2].
+
+    Beyond a limit different actions have the same effect, so that no other term would keep the policy within limits.
+    """
     return robot.clipped
 
 

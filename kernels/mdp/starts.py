@@ -1,6 +1,7 @@
 """Helpers of all tasks to sample start states: foot positions, inverse kinematics of a leg, orientations.
 
-A foot position is the ankle (the paw's centre) unless stated otherwise.
+A foot position is the ankle (the paw's centre) unless stated otherwise. Legs are FL, FR, BL, BR; body axes x ahead,
+y left, z up. Motors are lateral (positive outward), outer and inner (positive away from the leg's other thigh).
 """
 
 import warp as wp
@@ -70,7 +71,10 @@ def sample_foot_offset(
 
 @wp.func
 def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
-    """Return the orientation (xyzw, body to world) of yaw, pitch and roll [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the orientation (xyzw, body to world) of yaw, pitch and roll [rad]: Rz(yaw) Ry(pitch) Rx(roll).
+
+    A positive pitch lowers the nose, a positive roll raises the left side.
+    """
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)

@@ -1,4 +1,9 @@
-"""End of a policy step: advance the task's state, then terminations, rewards and the curriculum."""
+"""End of a policy step: advance the task's state, then terminations, rewards and the curriculum.
+
+A task's terms are compiled into one kernel, which loads the robot once. Their numbers (weights, widths) are read from
+the array `p`, so that they can change without another kernel. An episode ends by failure (`terminated`, its value is 0
+from then on) or without (`truncated`, as at a time limit, where training estimates the value of what would follow).
+"""
 
 from typing import Any
 
@@ -28,6 +33,7 @@ def update_curriculum(
 ):  # fmt: skip
     """Count an ended episode for the curriculum: `promote_after` successes in a row raise the world's level.
 
+    Each world has a level of its own, so goals become harder where the policy succeeds.
     error: curriculum error of the episode in the task's unit, summed over successes. num_levels: level past the last.
     """
     streak = wp.where(success, episode.streak[world] + 1, 0)

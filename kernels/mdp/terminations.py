@@ -1,6 +1,7 @@
 """Termination terms that any task can use, as functions of the robot's state, the task's state and parameters.
 
-A task's state has the number of policy steps of the episode in `steps`.
+A task's state has the number of policy steps of the episode in `steps`. World z is up. The first term of a task's table
+that holds ends the episode.
 """
 
 from typing import Any
@@ -37,7 +38,10 @@ def tilted(robot: RobotView, state: Any, angle: float) -> bool:
 
 @wp.func
 def fallen(robot: RobotView, state: Any, angle: float) -> bool:
-    """Terminate when body z is more than `angle` [rad] from world z while a paw is on the ground."""
+    """Terminate when body z is more than `angle` [rad] from world z while a paw is on the ground.
+
+    In flight a robot may be tilted, and turn before it lands.
+    """
     return robot.contacts > 0 and tilt(robot) > angle
 
 

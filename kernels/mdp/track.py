@@ -1,4 +1,7 @@
-"""Paw kinematics, contact timers and collisions at the end of a policy step."""
+"""Paw kinematics, contact timers and collisions at the end of a policy step.
+
+Rewards and observations read the results once per policy step; physics steps need none of them.
+"""
 
 import warp as wp
 
@@ -40,7 +43,8 @@ def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: 
 def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
     """Update contact time, air time [s] and touchdown speed [m/s] of a paw; down: whether it is in contact.
 
-    At the first contact `air_time` still holds the length of the swing; it is 0 from the next step on.
+    At the first contact `air_time` still holds the length of the swing, which rewards for long swings read; it is 0
+    from the next step on. `paw_vel` is that before the contact, which stops the paw.
     """
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:

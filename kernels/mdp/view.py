@@ -1,4 +1,9 @@
-"""State of a robot that rewards, terminations and observations read (`RobotView`), and its arrays (`RobotArrays`)."""
+"""State of a robot that rewards, terminations and observations read (`RobotView`), and its arrays (`RobotArrays`).
+
+A view gathers one robot's values in the form that terms need, so that a term indexes no arrays. World z is up; body
+axes are x ahead, y left, z up; quaternions are xyzw, body to world. Lateral angles are positive outward, outer and
+inner ones away from the leg's other thigh.
+"""
 
 import warp as wp
 
@@ -116,7 +121,11 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the state of a world's robot (`RobotView`) of which only the base is read; motors and paws are 0."""
+    """Return the state of a world's robot (`RobotView`) of which only the base is read; motors and paws are 0.
+
+    Newton's joint_qd has the velocity of the base's centre of mass and the angular velocity in world axes; the view has
+    the velocity of the origin, and the angular velocity in body axes.
+    """
     j = world * DOFS
     robot = RobotView()
     robot.world = world
@@ -193,7 +202,7 @@ def is_finite(robot: RobotView) -> bool:
 def has_diverged(robot: RobotView) -> bool:
     """Return whether the simulation of a robot diverged: its state is not finite or too fast.
 
-    Too fast is more than 15 m/s or 40 rad/s of the base, or 120 rad/s of any motor.
+    Too fast is more than 15 m/s or 40 rad/s of the base, or 120 rad/s of any motor: beyond all that the robot can do.
     """
     fastest = float(0.0)
     for m in range(12):
@@ -234,6 +243,8 @@ def tilt(robot: RobotView) -> float:
 def base_deceleration(robot: RobotView) -> float:
     """Return minus the base's deceleration along its previous velocity [m/s^2]; 0 if it speeds up.
 
+    Plastic contact can stop the base within a step: the velocity before the step, not the one after, has the direction
+    of the impact.
     It is a mean of the policy step, <= 0. A rebound does not count: at most the whole previous speed is lost within a
     policy step.
     """

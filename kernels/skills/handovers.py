@@ -1,6 +1,8 @@
 """Handovers between walking, jumping and turning in flight: conditions (`*_due`) and initial task states (`begin_*`).
 
-Neither function changes the robot's state. requested: whether `Env.request` requested the target skill.
+Neither function changes the robot's state. requested: whether `Env.request` requested the target skill. A skill takes
+over in states like those from which its training starts, or where the other skill has failed. World z is up, policy
+steps last 1/60 s.
 """
 
 import warp as wp
@@ -108,7 +110,10 @@ def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) ->
 
 @wp.func
 def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
-    """Return the initial state of turning during a jump's flight; the goal is level, with the heading of the jump."""
+    """Return the initial state of turning during a jump's flight; the goal is level, with the heading of the jump.
+
+    The state keeps start and goal of the jump, which `begin_landing` needs.
+    """
     new = AttitudeState()
     new.jump_start = state.start
     new.jump_goal = state.goal
@@ -119,7 +124,10 @@ def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
 
 @wp.func
 def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
-    """Return the initial state of a jump after turning in its flight: in flight, past its apex."""
+    """Return the initial state of a jump after turning in its flight: in flight, past its apex.
+
+    Start, goal and heading are those of the jump that the turn interrupted.
+    """
     new = JumpState()
     new.phase = FLIGHT
     new.start = state.jump_start

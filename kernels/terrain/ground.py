@@ -1,6 +1,7 @@
 """Ground under the paws: a plane z = 0 or a heightfield, and optionally a sliding block in each world.
 
-Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
+Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`. Points are
+in the world frame, z up. "Floor" is plane or heightfield, without the block.
 """
 
 import warp as wp
@@ -52,7 +53,10 @@ def world_ground(ground: Ground, world: int) -> Ground:
 
 @wp.func
 def grown_block(ground: Ground, margin: float) -> Ground:
-    """Return a copy of a world's ground whose block is larger by `margin` [m] on all four sides and at the top."""
+    """Return a copy of a world's ground whose block is larger by `margin` [m] on all four sides and at the top.
+
+    For collision checks, in which training keeps links at a distance from obstacles.
+    """
     here = ground
     here.block.half += vec2(real(margin), real(margin))
     here.block.height += real(margin)

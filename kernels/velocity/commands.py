@@ -1,4 +1,8 @@
-"""Velocity commands: sampled at resets and within episodes, or set from Python (`Env.command`)."""
+"""Velocity commands: sampled at resets and within episodes, or set from Python (`Env.command`).
+
+A command is (ahead, to the left [m/s], yaw rate [rad/s]), body axes; positive yaw turns left. A curriculum widens its
+range with a world's level. Random numbers are identified by an index in a stream (`streams`).
+"""
 
 import warp as wp
 
@@ -42,7 +46,10 @@ def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
 
 @wp.func
 def sample_component(rng: RngStream, i: int, lower: float, upper: float, smallest: float) -> float:
-    """Return a sampled component of a command, uniform between lower < 0 and upper > 0, at least `smallest` from 0."""
+    """Return a sampled component of a command, uniform between lower < 0 and upper > 0, at least `smallest` from 0.
+
+    The two sides of the range are shrunk away from 0, so that no value is rejected.
+    """
     value = uniform(rng, i, lower, upper)
     if smallest <= 0.0:
         return value
@@ -55,7 +62,8 @@ def sample_component(rng: RngStream, i: int, lower: float, upper: float, smalles
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
-    Above level 0, lateral velocity and yaw rate are scaled down with the forward speed, by an ellipse, to at least 0.2.
+    Above level 0, lateral velocity and yaw rate are scaled down with the forward speed, by an ellipse, to at least 0.2:
+    the highest speeds are commanded one at a time.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.standing_probability:

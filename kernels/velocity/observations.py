@@ -1,4 +1,8 @@
-"""Observation terms of velocity tracking: measurable terms for actor and critic, and terms for the critic alone."""
+"""Observation terms of velocity tracking: measurable terms for actor and critic, and terms for the critic alone.
+
+Body axes are x ahead, y left, z up; paws are FL, FR, BL, BR. `set_mirror` states how a term changes if the robot is
+mirrored left to right: column numbers, negative where the sign changes. Factors scale values to the order of 1.
+"""
 
 import warp as wp
 
@@ -20,7 +24,7 @@ def command(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 @wp.func
 def gait_phase(robot: RobotView, state: VelocityState) -> wp.vec2:
-    """Sine and cosine of the gait's phase [1]."""
+    """Sine and cosine of the gait's phase [1], which, unlike the phase, do not jump at the end of a cycle."""
     angle = 2.0 * wp.pi * state.phase
     return wp.vec2(wp.sin(angle), wp.cos(angle))
 

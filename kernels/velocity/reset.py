@@ -1,4 +1,7 @@
-"""Reset of velocity tracking: update curriculum levels, sample a command; `start_states` samples the robot state."""
+"""Reset of velocity tracking: update curriculum levels, sample a command; `start_states` samples the robot state.
+
+Each world has two levels, of commanded speeds and of terrain difficulty; both rise with success and fall after falls.
+"""
 
 import warp as wp
 
@@ -21,7 +24,7 @@ FALL_PENALTY = wp.constant(60.0)  # [m/s] subtracted from the score for a fall, 
 
 @wp.func
 def map_limit(map: TileMap) -> wp.vec2:
-    """Return the half extents [m] of the terrain map along x and y, 0 without a map."""
+    """Return the half extents [m] of the terrain map along x and y, from its centre, the origin; 0 without a map."""
     return 0.5 * map.tile * wp.vec2(float(map.rows), float(map.cols))
 
 

@@ -1,7 +1,9 @@
 """Reward terms of velocity tracking (paper, Tables II and III), as functions of robot, command and parameters.
 
-Penalties have negative weights in the tasks, unless their values are negative. phi: Gaussian kernel of `mdp.rewards`;
-std: its width, in the unit of its argument.
+Penalties have negative weights in the tasks, unless their values are negative. phi: Gaussian kernel of `mdp.rewards`,
+exp(-(x / std)^2); std: its width, in the unit of its argument. World z is up; body axes are x ahead, y left, z up. Paws
+and legs k are FL, FR, BL, BR. Motors of a leg are lateral (m % 3 = 0) and two transversal ones, outer and inner,
+positive away from the leg's other thigh.
 """
 
 import warp as wp
@@ -72,7 +74,8 @@ def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: 
 def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -> float:
     """Penalty of lateral motors far from the default pose: 0 near it, -1 for each motor far from it.
 
-    It is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad].
+    It is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad]. The high power leaves a range
+    free, instead of pulling toward its middle. Values are negative, so the weight is positive.
     """
     total = float(0.0)
     for m in range(12):
@@ -86,7 +89,8 @@ def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -
 def transversal_position(robot: RobotView, state: VelocityState, steepness: float, shift: float) -> float:
     """Penalty of transversal motors far from the default angle plus `shift` [rad]: 0 near it, -1 for each one far off.
 
-    It is the sum over them of exp(-steepness offset^20) - 1; offset [rad].
+    It is the sum over them of exp(-steepness offset^20) - 1; offset [rad]. The high power leaves a range free, instead
+    of pulling toward its middle. Values are negative, so the weight is positive.
     """
     total = float(0.0)
     for m in range(12):
@@ -99,7 +103,10 @@ def transversal_position(robot: RobotView, state: VelocityState, steepness: floa
 
 @wp.func
 def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Reward for long swings when commanded to move: swing duration less `threshold` [s], of paws that touch down."""
+    """Reward for long swings when commanded to move: swing duration less `threshold` [s], of paws that touch down.
+
+    Swings shorter than the threshold cost: shuffling does not pay.
+    """
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * (robot.air_time[k] - threshold)
@@ -137,7 +144,8 @@ def restless_stand(robot: RobotView, state: VelocityState) -> float:
 def foot_clearance(robot: RobotView, state: VelocityState, target_height: float) -> float:
     """Penalty of paws that swing above or below `target_height` [m], weighted by their horizontal speed.
 
-    It is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s].
+    It is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]. A paw is fast in
+    the middle of its swing, where it should be high, and slow where it lifts and lands.
     """
     total = float(0.0)
     for k in range(4):

@@ -1,6 +1,8 @@
 """Start states of velocity tracking: base pose and velocity, and foot positions, sampled on any ground.
 
-If no attempt is valid, the episode begins in the default pose.
+If no attempt is valid, the episode begins in the default pose. Starts in motion and with lifted paws show the policy
+states that it meets while walking. World z is up, quaternions are xyzw (body to world), a heading is a yaw [rad].
+Motors of a leg are lateral (positive outward), outer and inner (positive away from the leg's other thigh).
 """
 
 import warp as wp
@@ -131,7 +133,8 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return sampled motor angles and rates of leg `leg`: paw at rest on the ground, or lifted with rates 0.
 
-    It is lifted with `swing_probability`.
+    It is lifted with `swing_probability`. A paw at rest on the ground under a moving base needs motor rates: its
+    velocity relative to the base is minus that of the base at the paw.
     """
     settings = start.settings
     offset = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)

@@ -1,4 +1,8 @@
-"""State of velocity tracking (`VelocityState`), its update in a policy step, and its errors."""
+"""State of velocity tracking (`VelocityState`), its update in a policy step of 1/60 s, and its errors.
+
+Body axes are x ahead, y left, z up. A yaw rate counts 0.3 m times itself beside a speed: about the speed [m/s] of a
+point 0.3 m from the base's centre.
+"""
 
 import warp as wp
 
@@ -14,6 +18,7 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 class VelocityState:
     """State of velocity tracking in a world: command, gait, tracking errors, curriculum levels and statistics.
 
+    Errors count only in settled policy steps: right after a command the robot still has to accelerate.
     Fields from `sum_xy` on accumulate until the host reads them.
     """
 
@@ -55,7 +60,11 @@ def velocity_error(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 @wp.func
 def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
-    """Return the task state with the paws' touchdowns and swing heights of this policy step included."""
+    """Return the task state with the paws' touchdowns and swing heights of this policy step included.
+
+    `recent` holds one bit per policy step and paw: a touchdown enters at bit 0 and leaves `recent_steps` 45 steps
+    (0.75 s) later.
+    """
     t = state
     for k in range(4):
         touchdown = robot.first_contact[k]
@@ -74,7 +83,8 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
     """Return the state of velocity tracking (errors, step counts, gait phase) updated by one policy step.
 
-    Errors count only when more than `settle` policy steps have passed since the command.
+    Errors count only when more than `settle` policy steps have passed since the command: a robot needs time to change
+    its speed. `score` compares policies during training; it grows with commanded speed and terrain level.
     """
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1

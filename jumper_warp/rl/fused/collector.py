@@ -1,4 +1,8 @@
-"""Rollout collection with the fused kernels, which stores observations as normalised inputs of actor and critic."""
+"""Rollout collection with the fused kernels, which stores observations as normalised inputs of actor and critic.
+
+Inputs ("features") are normalised once, when they are observed, instead of in each of the update's epochs. A sample is
+one world in one policy step. Padding with zeros gives matrices the widths that the kernels need.
+"""
 
 from __future__ import annotations
 
@@ -118,7 +122,10 @@ class FusedCollector:
         )  # fmt: skip
 
     def record(self, step: int) -> None:
-        """Write an environment step's reward, done, timeout and final observation to the rollout; count episodes."""
+        """Write an environment step's reward, done, timeout and final observation to the rollout; count episodes.
+
+        The final observation is the last one of an episode that has ended, which the critic needs at a timeout.
+        """
         env, rollout, worlds = self.env, self.rollout, self.env.num_envs
         self.critic_obs.write(self._final_critic_obs, rollout.final_features[step])
         launch(kernels.record_step, (blocks(worlds, ROWS),))(

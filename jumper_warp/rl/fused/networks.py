@@ -30,7 +30,10 @@ _noted: list[tuple[Any, tuple, dict[str, Any]]] | None = None  # Kernels to comp
 
 
 class Layer(NamedTuple):
-    """Location of a layer's weight and bias in the kernels' padded parameter vector, and the layer's padded widths."""
+    """Location of a layer's weight and bias in the kernels' padded parameter vector, and the layer's padded widths.
+
+    The kernels multiply tiles of fixed width, so that they need padded copies of the parameters (`FlatParameters`).
+    """
 
     weight: int  # first entry of the weight (outputs, inputs)
     bias: int  # first entry of the bias (outputs,)
@@ -41,6 +44,8 @@ class Layer(NamedTuple):
 
 class FusedLayout:
     """Offsets of all parameters in the zero-padded vector of parameters that the fused kernels read.
+
+    Padding makes all widths multiples of the tensor cores' tiles.
 
     Partial sums of the gradients have the same offsets.
 
@@ -218,7 +223,10 @@ def power_of_two(width: int) -> int:
 
 
 def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]:
-    """Return how each layer's weight gradient is divided into tiles: first tile, next layer's first tile, BM and BN."""
+    """Return how each layer's weight gradient is divided into tiles: first tile, next layer's first tile, BM and BN.
+
+    Tiles of BM x BN entries of all layers are numbered on, so that one launch computes the gradients of all layers.
+    """
     tiles, count = [], 0
     for layer in layers:
         bm, bn = (min(power_of_two(width), 128) for width in (layer.outputs, layer.inputs))
@@ -235,7 +243,8 @@ def rows_per_split(rows: int, splits: int) -> int:
 def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 3) -> Launch:
     """Return a function that launches a Triton kernel on a grid; its arguments are the kernel's.
 
-    Within `compile_side_by_side` the function launches nothing, but notes the kernel.
+    Within `compile_side_by_side` the function launches nothing, but notes the kernel. num_warps, num_stages: options
+    of Triton's compiler.
     """
     options = {"num_warps": num_warps, "num_stages": num_stages}
     if (noted := _noted) is None:
@@ -263,5 +272,8 @@ def compile_side_by_side(launches: Callable[[], object], device: torch.device) -
 
 
 def _variant(argument: Any) -> Any:
-    """Return what Triton compiles a kernel for: the type of a tensor's entries, the value of another argument."""
+    """Return what Triton compiles a kernel for: the type of a tensor's entries, the value of another argument.
+
+    Launches with equal variants share one compiled kernel.
+    """
     return argument.dtype if isinstance(argument, torch.Tensor) else argument

@@ -31,8 +31,9 @@ class FusedUpdate:
     ) -> None:  # fmt: skip
         """Allocate the memory of the update; fused: networks of `model`, with the rows of a minibatch at least.
 
-        coefficients: desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`;
-        obs_mirror: map that symmetrises observation statistics.
+        With many ranks gradient and update are separate graphs, between which the gradients are averaged. coefficients:
+        desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`; obs_mirror: map that
+        symmetrises observation statistics.
         """
         self._collector, self._cfg, self._model, self._obs_mirror = collector, cfg, model, obs_mirror
         self._optimiser, self._flat, self._fused, self._sums = optimiser, optimiser.flat, fused, sums
@@ -107,7 +108,11 @@ class FusedUpdate:
         stream.wait_stream(self._side_stream)
 
     def compute_gradient(self, samples: torch.Tensor) -> None:
-        """Write losses and gradient of a minibatch to `FlatParameters.all_reduced`; samples: indices (batch,)."""
+        """Write losses and gradient of a minibatch to `FlatParameters.all_reduced`; samples: indices (batch,).
+
+        The kernels leave partial sums, each of some of the samples; they are added in a fixed order, which repeats
+        bitwise.
+        """
         self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
         fused, gradient = self._fused, self._flat.all_reduced
         launch(kernels.sum_partials, (blocks(len(gradient), SUM_BLOCK),))(

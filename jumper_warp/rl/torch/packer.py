@@ -1,4 +1,8 @@
-"""Conversion of a rollout to training samples with values, advantages and returns, by PyTorch functions."""
+"""Conversion of a rollout to training samples with values, advantages and returns, by PyTorch functions.
+
+A sample is one world in one policy step; time-major: all worlds of step 0, then those of step 1. The critic predicts
+normalised returns (zero mean, unit variance), so that its scale does not depend on the rewards'.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +84,8 @@ def compute_values_and_gae(
 ) -> Estimates:
     """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
-    A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
+    A timeout adds the discounted value of the final observation: the episode was cut, and would have earned more.
+    chunk_size: samples per evaluation of the critic.
     """
 
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,8 @@
 """Proximal policy optimisation (PPO) with PyTorch functions: normalised observations, returns and advantages.
 
-Surrogate: Schulman et al. 2017; advantage: Schulman et al. 2016. The learning rate adapts to the KL divergence.
+Surrogate: Schulman et al. 2017; advantage: Schulman et al. 2016. The learning rate adapts to the KL divergence between
+the policy that acted ("old") and the present one ("new"). With a left-right symmetric robot, M mirrors an observation,
+N an action, and f is the actor's network (`jumper_warp.rl.mirror`).
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ class Losses(NamedTuple):
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     value: torch.Tensor  # value loss before weighting [variances of the return]
     entropy: torch.Tensor  # entropy of the policy [nat]
-    asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry
+    asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), 0 for a symmetric network; logged, not minimised
     kl: torch.Tensor  # KL(old ‖ new) [nat]
 
 
@@ -77,6 +79,7 @@ class Ppo(Learner):
 def ppo_losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg: PpoCfg) -> Losses:
     """Return the losses of PPO on a minibatch; only the first three have a gradient.
 
+    Clipping removes the incentive to move the policy further than `clip` in one update.
     The surrogate is that of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
     The value loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value
     clipped to within `clip` of the rollout's value. old_log_std: (num_actions,) of the policy that acted.

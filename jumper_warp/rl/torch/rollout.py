@@ -1,4 +1,8 @@
-"""Rollout collection: run the policy in all worlds, and record the transitions in a buffer."""
+"""Rollout collection: run the policy in all worlds, and record the transitions in a buffer.
+
+Each policy step is written to the buffer in two parts: `_act_step` before the environment's step (observation, action),
+`_record_step` after it (reward, end). Nothing waits for the host, so that a rollout can be a captured graph.
+"""
 
 from __future__ import annotations
 

@@ -234,7 +234,7 @@ class ResetCfg:
         return self.ground.drawn
 
     def on_level_ground(self) -> ResetCfg:
-        """Return a copy of the configuration without sampled platforms and blocks."""
+        """Return a copy of the configuration without sampled platforms and blocks, as for nominal evaluations."""
         return replace(self, ground=GroundCfg())
 
     def _ranges(self, step_dt: float) -> KernelStruct:

@@ -160,7 +160,10 @@ def horizontal_jump_sighted() -> TaskCfg:
 
 
 def omnidirectional_jump() -> TaskCfg:
-    """Return the task of a horizontal jump in all directions, with half the symmetry reward of the jump ahead."""
+    """Return the task of a horizontal jump in all directions, with half the symmetry reward of the jump ahead.
+
+    A jump to the side needs different motions of left and right legs.
+    """
     task = horizontal_jump()
     settings = replace(
         RESET, forward_pitch=0.0, takeoff_pitch=(0.0, 0.0), takeoff_ahead=(0.0, 0.2), touchdown_behind=(0.05, 0.12)

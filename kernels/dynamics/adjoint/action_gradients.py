@@ -1,6 +1,8 @@
 """Gradients of a physics step, for CPU and GPU kernels: derivatives of its virtual power (see `virtual_power`).
 
-A gradient w.r.t. x has the axes and the order of x.
+The virtual power is one number: the step's equations times their adjoint multipliers. Its derivative w.r.t. an input x,
+with multipliers, end velocities and impulses held constant, is the gradient of the loss w.r.t. x. It has the axes and
+the order of x. Legs are 0 to 3: FL, FR, BL, BR; vectors of motors are lateral, outer, inner.
 """
 
 import warp as wp
@@ -80,7 +82,9 @@ def make_leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power is differentiated: multipliers, motion, contact.
 
-    rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s].
+    rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s]. virtual_rates, law:
+    multipliers of the motors' equations and of the contact law. mode: SEPARATE, STICK or SLIDE. pressed: set of pressed
+    hard stops. impulse [N s]: on the paw, body axes; push: gradient of the loss w.r.t. it, world axes.
     """
     factors = LegFactors()
     factors.virtual_rates = virtual_rates

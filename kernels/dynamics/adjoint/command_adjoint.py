@@ -1,6 +1,9 @@
 """Reverse pass of motors, latency and command filter: gradients w.r.t. targets and constants from those of torques.
 
-Motors are 0 to 11 (legs FL, FR, BL, BR; each lateral, outer, inner).
+Motors are 0 to 11 (legs FL, FR, BL, BR; each lateral, outer, inner). A cotangent is the gradient of the loss w.r.t. a
+result, from which the gradient w.r.t. the inputs follows. `sums` and `shared` take gradients w.r.t. parameters: those
+of one leg or motor, and those that all motors of a world share. On a GPU they differ in the threads that are summed
+over first (`ThreadSums`); on a CPU both are the same array of one world.
 """
 
 from typing import Any
@@ -41,7 +44,8 @@ class FilterAdjoint:
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
     """Add a number to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
 
-    step: policy step, -1 for the initial target.
+    A motor follows a target in several physics steps, each of which adds its part. step: policy step, -1 for the
+    initial target, which a motor follows until the first one arrives.
     """
     if step < 0:
         # atomic to avoid a load: no other thread writes here
@@ -58,7 +62,8 @@ def motor_gradient(
     """Return the derivatives of a motor's torque in a physics step w.r.t. target, joint state, constants and latency.
 
     step: physics step of dt [s], at angle [rad], rate [rad/s]. params: the motor's constants. delay: latency in physics
-    steps. filtered_target [rad]: (T, 12, num_worlds).
+    steps, a real number: the target is interpolated between two policy targets, so that it has a derivative w.r.t. the
+    latency. filtered_target [rad]: (T, 12, num_worlds).
     """
     adjoint = MotorAdjoint()
     arrived = arrival(step, timing.substeps, delay)
@@ -90,8 +95,9 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
     """Add a physics step's gradient of the loss w.r.t. a motor's constants and latency to the stored gradients.
 
-    That w.r.t. constants goes to `sums`, that w.r.t. the latency to `shared`. cotangent: gradient w.r.t. the motor's
-    torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
+    By the chain rule it is `cotangent`, the gradient w.r.t. the motor's torque, times the torque's derivatives in
+    `adjoint`. Gains, limits and sensor offset belong to one motor and go to `sums`. Over-speed limits and latency are
+    common to a world's motors and go to `shared`. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
     """
     add_motor(sums, shared, motor, cotangent, adjoint.constants)
     add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
@@ -133,5 +139,9 @@ def filter_gradient(
 
 @wp.func
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
-    """Add the gradient w.r.t. a leg's measured angles to the gradient w.r.t. its position sensors' offsets."""
+    """Add the gradient w.r.t. a leg's measured angles to the gradient w.r.t. its position sensors' offsets.
+
+    A measured angle is the true one plus the offset, so both have the same gradient. The offsets' rows follow six
+    constants of all 12 motors.
+    """
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

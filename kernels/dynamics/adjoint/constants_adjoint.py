@@ -1,6 +1,8 @@
 """GPU kernels that add a rollout's gradient of the loss w.r.t. leg and motor constants, all steps in parallel.
 
-They read the multipliers that `reverse_legs_kernel` has recorded.
+They read the multipliers that `reverse_legs_kernel` has recorded. With these, no step depends on another one any more:
+a thread takes every n-th step, and the threads' sums are added up. A trajectory has a row every `timing.every` physics
+steps; a `Span` is a range of rows, whose steps are in a `LegRecord`, one entry a step.
 """
 
 import warp as wp
@@ -37,7 +39,10 @@ def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
 
 @wp.func
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
-    """Return physics step k (from 0) of a range of trajectory rows; beyond the range, the last step with weight 0."""
+    """Return physics step k (from 0) of a range of trajectory rows; beyond the range, the last step with weight 0.
+
+    All threads of a warp must take part in its sums, also those that have no step left.
+    """
     step = SpanStep()
     end = span.end * timing.every
     step.step = span.begin * timing.every + k

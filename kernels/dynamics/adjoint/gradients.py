@@ -1,7 +1,9 @@
 """Arrays of the gradient of a rollout's loss w.r.t. its inputs, and functions that add to them.
 
 `add_*` take `sums`, an array (GRADIENT_ROWS,) of one world or `ThreadSums`, and add a struct of gradients, entry by
-entry, to the rows of the parameters it names; leg: 0 to 3, motor: 0 to 11.
+entry, to the rows of the parameters it names; leg: 0 to 3, motor: 0 to 11. A CPU thread owns a world and sums in a
+local array. On a GPU many threads share a world: they sum over their warp first, and one adds the result atomically.
+A struct of gradients has the type of the parameters: its field `kp` is the gradient w.r.t. `kp`.
 """
 
 from typing import Any
@@ -63,7 +65,11 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1."""
+    """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1.
+
+    The caller sets the weight 0 where a thread repeats a step of another one only to take part in the warp's sums.
+    writes, over_steps, over_legs: see `ThreadSums`.
+    """
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -180,7 +186,8 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
     """Add the gradient w.r.t. the base's centre of mass to those w.r.t. its mass and first moment, by the chain rule.
 
-    gradient: w.r.t. com [m]. mass [kg]: of the base, its first moment is mass * com.
+    gradient: w.r.t. com [m]. mass [kg]: of the base. The table holds the mass and the first moment mass * com, and com
+    is their quotient.
     """
     add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)
     add_vec3(sums, layout.BASE + 1, gradient / mass)

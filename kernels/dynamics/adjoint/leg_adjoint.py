@@ -3,6 +3,11 @@
 1. `replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, many steps in parallel.
 2. `reverse_leg` goes backwards from step to step and records multipliers.
 3. `add_leg_constants` adds the gradients w.r.t. parameters, computed from these, many steps in parallel.
+
+Only the second part is sequential. A cotangent is the gradient of the loss w.r.t. a result of the step; multipliers
+("weights") are the solution of the step's transposed equations, see `step_adjoint`. `sum_*` add values of a world's
+four threads, `*_from_leg` read the value of another thread. An entry of the record is a physics step. Vectors of motors
+are lateral, outer, inner.
 """
 
 import warp as wp
@@ -132,7 +137,7 @@ def replay_leg(
 
 @wp.func
 def any_leg(flag: bool) -> bool:
-    """Return whether any of the four threads (legs) of the world sets the flag."""
+    """Return whether any of the four threads (legs) of the world sets the flag; all four get the same answer."""
     return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
 
 
@@ -204,8 +209,8 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
     """Return the multiplier of the contact law of this thread's paw, from the gradient w.r.t. all paws' impulses.
 
-    impulse_cotangent: gradient w.r.t. this paw's impulse. row: see `inverted_laws`. Threads of separated paws must pass
-    0.
+    impulse_cotangent: gradient w.r.t. this paw's impulse. row: see `inverted_laws`; this paw's row of A^-T, one 3x3
+    block per paw. Threads of separated paws must pass 0.
     """
     total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
     return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
@@ -227,7 +232,8 @@ def leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power in a recorded step is differentiated.
 
-    step: its number in the rollout; dt [s]; i: its entry in the record.
+    Its acceleration follows from the rates of this entry and the next. step: its number in the rollout; dt [s]; i: its
+    entry in the record.
     """
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
@@ -350,7 +356,10 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add a step's gradient of the loss w.r.t. all constants of a leg, friction coefficients included, to `sums`."""
+    """Add a step's gradient of the loss w.r.t. all constants of a leg, friction coefficients included, to `sums`.
+
+    Both rows of friction are added to, one of them 0, since all threads of a warp must make the same calls.
+    """
     add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))

@@ -1,7 +1,9 @@
 """Record of a few recomputed physics steps, for the reverse pass of a rollout with a thread per leg.
 
-`get_*` and `put_*` read and write the fields of one entry (a step) and world; indices of world and leg come last for
-coalesced access.
+The reverse pass needs values of every step, such as inverse inertias, that would take too much memory for a whole
+rollout: the steps of a few trajectory rows at a time are recomputed and recorded here. `get_*` and `put_*` read and
+write the fields of one entry (a step) and world; indices of world and leg come last for coalesced access. A multiplier
+is a solution of the step's transposed equations, one number per equation (`step_adjoint`).
 """
 
 import warp as wp
@@ -55,7 +57,10 @@ class BaseWeights:
 
 @wp.struct
 class LegWeights:
-    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step."""
+    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step.
+
+    The pass backwards in time solves them; the kernels of `constants_adjoint` read them, all steps in parallel.
+    """
 
     rates: vec3  # virtual rates of the motors
     law: vec3  # multiplier of the contact law, body axes
@@ -199,7 +204,10 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`."""
+    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`.
+
+    The transposed equations, which the reverse pass solves, have the same matrices, and another right-hand side.
+    """
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)

@@ -1,6 +1,8 @@
 """Recomputation of a step, and adjoint multipliers of its equations of motion and contact laws; see `step_adjoint`.
 
-`legs` is scratch of the thread, (4,), legs FL, FR, BL, BR.
+The functions run in one thread per world. A step solves M (v' - v) = dt f + J^T p with contact laws R(p, v') = 0; the
+multipliers solve its transposed equations, one number per equation. A cotangent is the gradient of the loss w.r.t. a
+result. `legs` is scratch of the thread, (4,), legs FL, FR, BL, BR.
 """
 
 import warp as wp
@@ -157,7 +159,7 @@ def replay_step(
 def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
     """Solve a linear system a x = b by Gaussian elimination with row pivoting; x replaces b.
 
-    Uses the first n rows and columns, and overwrites a.
+    Uses the first n rows and columns, and overwrites a. Used for the contact laws' 3 to 12 equations.
     """
     for col in range(n):
         best = col
@@ -191,6 +193,7 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 def solve_laws(legs: wp.array(dtype=LegReverse)):
     """Solve for the adjoint multipliers of all paws' contact laws, one linear system, by Gaussian elimination.
 
+    The system is A^T l = -(gradient w.r.t. the impulses), see `step_adjoint`; paws couple through the base.
     `multiplier` of each leg is the gradient w.r.t. its paw's impulse before, and the multiplier (0 if separated) after.
     """
     matrix = wp.zeros(shape=(12, 12), dtype=real)
@@ -273,7 +276,8 @@ def add_laws(
 ) -> Multipliers:  # fmt: skip
     """Add the contribution of the paws' contact laws to the adjoint multipliers of the equations of motion.
 
-    Returns those of the base; updates the motors' in `legs`, which holds the laws.
+    A law's multiplier acts like a gradient y w.r.t. the contact point's velocity, and is passed on to base and motors.
+    Returns the base's multipliers; updates the motors' in `legs`, which holds the laws.
     """
     m = multipliers
     law_lin = vec3(real(0.0))

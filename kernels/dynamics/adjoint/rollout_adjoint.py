@@ -1,7 +1,13 @@
 """Reverse pass of a rollout: all its steps in one launch, with one thread per world.
 
 The rows are visited backwards: the steps between two rows are recomputed with the impulses of the rollout, then run
-backwards one by one (`step_adjoint`, `virtual_power`).
+backwards one by one (`step_adjoint`, `virtual_power`). Storing only rows saves memory, and given impulses save the
+contact iteration.
+
+A row holds the base's position and orientation (xyzw), velocity of its centre of mass and angular velocity (world
+axes), then the motors (lateral, outer, inner of FL, FR, BL, BR); `BaseState` has the velocity of the origin and the
+angular velocity in body axes. A cotangent is the gradient of the loss w.r.t. a result; the adjoint of a function maps
+it to the gradient w.r.t. the arguments. `legs`, `sums`: the thread's gradients w.r.t. motors and parameters so far.
 """
 
 import warp as wp
@@ -79,7 +85,7 @@ def load_row_base_adjoint(
     """Return the gradient w.r.t. a trajectory row's base entries: the adjoint of `load_row_base`.
 
     adj: gradient w.r.t. the base's state that was read from the row. later_com: gradient w.r.t. the base's centre of
-    mass, summed over the later rows.
+    mass, which converts the velocities of rows, summed over the later rows.
     """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
@@ -97,7 +103,10 @@ def load_row_base_adjoint(
 
 @wp.func
 def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
-    """Return `into` plus the gradient of the loss w.r.t. the base entries of a trajectory row, from `cotangent`."""
+    """Return `into` plus the gradient of the loss w.r.t. the base entries of a trajectory row, from `cotangent`.
+
+    `into` holds the effect of the row on later ones, `cotangent` its direct effect on the loss. Empty arrays mean 0.
+    """
     s = into
     if cotangent.q.shape[0] > 0:
         s.pos += row_vec3(cotangent.q, row, 0, world)
@@ -137,7 +146,10 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 
 @wp.func
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
-    """Add the gradient of the loss w.r.t. motor angles and rates of a trajectory row, from `cotangent`, to `legs`."""
+    """Add the gradient of the loss w.r.t. motor angles and rates of a trajectory row, from `cotangent`, to `legs`.
+
+    It is the direct effect of the row on the loss; `legs` holds that through later rows. Empty arrays mean 0.
+    """
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
             legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
@@ -187,7 +199,10 @@ def replay_row(
 
 @wp.func
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
-    """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t."""
+    """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t.
+
+    The wrench is constant in a policy step, whose physics steps each add their part. World axes, at the base's COM.
+    """
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
 
@@ -199,8 +214,10 @@ def add_motor_adjoint(
 ):  # fmt: skip
     """Backpropagate through a motor's torque in a step, and add the gradients to `legs`, `sums` and `gradients`.
 
-    motor: 0 to 11. `legs[k].torque` and cotangent.torque are the gradient w.r.t. the torque; angle and rate go to
-    `legs`, constants to `sums`, targets to `gradients`.
+    The torque depends on target, angle, rate and constants (`motor_torque`): each gets the gradient w.r.t. the torque
+    times its derivative in `by_motor`. The gradient w.r.t. the torque is its effect on the motion, `legs[k].torque`,
+    plus its direct effect on the loss, `cotangent.torque`. Angle and rate go to `legs`, constants to `sums`, targets to
+    `gradients`: `arrived` states which two policy targets the motor interpolated. motor: 0 to 11; at: the step.
     """
     k = motor / 3
     c = motor - 3 * k

@@ -2,7 +2,11 @@
 
 The pass runs over spans, each of some trajectory rows, from the last span to the first. Each span takes four launches:
 `replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel` runs backwards step by step; the
-two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all steps in parallel.
+two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all steps in parallel. Spans bound the memory of
+the record; `gradients.q` and `gradients.qd` carry the gradient from one span to the next.
+
+A trajectory has a row every `timing.every` physics steps. A cotangent is the gradient of the loss w.r.t. a result.
+Kernels launch full warps of eight worlds, whose threads exchange values: those beyond the last world repeat it.
 """
 
 import warp as wp
@@ -45,7 +49,10 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record entry of the first physics step after a trajectory row; each row takes `every` + 1 entries."""
+    """Return the record entry of the first physics step after a trajectory row.
+
+    Each row takes `every` + 1 entries: one a step, and the state after the last, from which no step starts.
+    """
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -135,7 +142,9 @@ def reverse_motors(
 ) -> LegAdjoint:  # fmt: skip
     """Return `old` plus the gradient w.r.t. a leg's angles and rates through its motor torques in a physics step.
 
-    slopes: derivatives of the torques. writes: whether this thread adds the gradient w.r.t. the targets to `gradients`.
+    old.torque and cotangent.torque: gradient w.r.t. the torques, through the motion and directly. slopes: derivatives
+    of the torques. arrived: which two policy targets each motor interpolated. writes: whether this thread adds the
+    gradient w.r.t. the targets to `gradients`.
     """
     adj = old
     torque_cotangent = adj.torque

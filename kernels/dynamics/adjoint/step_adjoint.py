@@ -42,8 +42,9 @@ def add_leg_gradient(
 ):
     """Add the gradient of leg k's virtual power w.r.t. its motors to `legs`, and w.r.t. its parameters to `sums`.
 
-    Also writes the gradient w.r.t. the motors' torques to `legs`. dt [s]: of the step. legs (4,): scratch. sums
-    (GRADIENT_ROWS,): gradient w.r.t. parameters.
+    Also writes the gradient w.r.t. the motors' torques to `legs`: dt times the multipliers, since torques enter the
+    equations as dt f. dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters; of
+    the two friction coefficients the step depends on the one in `mu_row`.
     """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:

@@ -68,8 +68,8 @@ class LegFactors:
     mode: int  # SEPARATE, STICK or SLIDE
     pressed: int  # set of pressed hard stops, see `stops`
     impulse: vec3  # [N s] on the paw, body axes
-    law: vec3  # multiplier of the contact law
-    push: vec3  # cotangent of the impulse, world axes
+    law: vec3  # multiplier of the contact law, body axes
+    push: vec3  # gradient of the loss w.r.t. the impulse as the trajectory stores it, world axes
 
 
 @wp.struct

@@ -6,6 +6,11 @@ because paws are coupled through the heavy base only; rounds end when no contact
 tolerance. If the largest change stops shrinking, each later round applies only the impulse of the paw that changes
 most. A step whose set of pressed stops proves wrong (see `world_step`) is repeated by its world, while the other
 worlds of a warp continue.
+
+Motors of a leg are lateral, outer, inner. A hard stop limits a motor's angle, or the sum of outer and inner; pressed
+stops change a leg's inertia, so that a step must assume a set of them before it is solved. `pressed` is such a set, one
+int of two bits per angle, 0: none. `sum_*`, `max_legs`, `first_leg`, `from_leg` exchange values among the four threads
+of a world, `any_world` among those of a warp; all threads must call them together.
 """
 
 import warp as wp
@@ -135,7 +140,12 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the set of hard joint stops to assume pressed in a leg's next attempt at a step of dt [s] from `old`."""
+    """Return the set of hard joint stops to assume pressed in a leg's next attempt at a step of dt [s] from `old`.
+
+    It is `old.pressed`: the preceding step's set, as stops often stay pressed for many steps, or after a rejected
+    attempt the set that attempt asked for. If the preceding step had none, the first attempt assumes the stops that the
+    leg would pass at its present rates. Limits are read only if a stop may matter, since most legs are far from all.
+    """
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -153,8 +163,8 @@ def required_stops(
 ) -> int:
     """Return which hard joint stops a leg must press, given the motor rates at which an attempted step ended.
 
-    The attempt had the set `pressed` and ended at `rates` [rad/s]. angles [rad]: at the start of the step. sets: number
-    of sets tried. The limits are reloaded to save registers.
+    The attempt was right if that is the set it assumed. It had the set `pressed` and ended at `rates` [rad/s]. angles
+    [rad]: at the start of the step. sets: number of sets tried. The limits are reloaded to save registers.
     """
     limits = load_stops(model.table, leg, world)
     required = int(0)
@@ -214,8 +224,8 @@ def advance_leg(
 ) -> LegState:  # fmt: skip
     """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other stops for a retry.
 
-    A world that has completed all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
-    thread moves its world's block.
+    A world that has completed all its steps keeps its state. It computes as the others do, since threads of a warp must
+    exchange values together. params, motors: of this thread's leg. writes: whether this thread moves its world's block.
     """
     dt = settings.dt
     blocks = model.ground.blocks.shape[0] > 0

@@ -1,7 +1,9 @@
 """Rollouts: policy steps of command filter, latency, motors and physics in one launch, with one thread per world.
 
 A rollout has T policy steps of S physics steps. For the reverse pass it records the state every `every` physics steps
-(a row), and torques, paw impulses and pressed stops of every physics step.
+(a row), and torques, paw impulses and pressed stops of every physics step. With these, the reverse pass can recompute
+the steps between two rows without solving for contact again. Each row's rounded state is also loaded again in the
+forward pass, so that both passes start from the same numbers.
 """
 
 import warp as wp

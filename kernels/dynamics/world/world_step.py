@@ -1,4 +1,9 @@
-"""Solution of one physics step of a world for its end velocities: base, legs, contacts and hard stops together."""
+"""Solution of one physics step of a world for its end velocities: base, legs, contacts and hard stops together.
+
+A pressed hard stop adds stiffness to its leg, and so changes inertia and contact; whether it is pressed depends on the
+rates at the end. The step is therefore solved with an assumed set of pressed stops (active set), and again with the set
+that the resulting rates require, until both agree. A set is an int of two bits per angle of a leg, see `stops`.
+"""
 
 import warp as wp
 

@@ -1,6 +1,8 @@
 """Triton kernels of layers and whole networks: forward and backward pass, and gradients of the weights.
 
-Tiles: BM rows, BN columns, BK terms of a product per pass. A row is a sample.
+Tiles: BM rows, BN columns, BK terms of a product per pass. A row is a sample. Each program of a launch computes one
+tile; masks cut off what lies beyond the matrices. ELU: x for x > 0, else exp(x) - 1; its slope follows from its output
+y alone, 1 + min(y, 0), so that inputs of layers need not be stored twice.
 """
 
 import triton
@@ -69,7 +71,8 @@ def network_forward(
 ):  # fmt: skip
     """Evaluate a network; write the output of its last layer or, with GATHER, the outputs of all its layers.
 
-    A block keeps its rows.
+    A block keeps its rows in registers from layer to layer, which saves writing and reading them; the update (GATHER)
+    needs all outputs for the backward pass.
     x, index, GATHER: as in `layer_forward`; value: flat vector of the parameters; outputs: of each layer. LAYERS: the
     layers, the first first; BIASES: of each its bias' place in `value` and number of entries; PADDED: powers of two,
     not less than its width.

@@ -1,4 +1,11 @@
-"""Triton kernels of the policy's mean action, and of the losses of actor and critic with their gradients."""
+"""Triton kernels of the policy's mean action, and of the losses of actor and critic with their gradients.
+
+The policy is Gaussian: mean action of the network, standard deviations exp(log_std). A mirror-symmetric actor has the
+mean (f(x) + N f(M x)) / 2, with network f, and the left-right mirror maps M of observations and N of actions. A row of
+`samples` is action (num_actions), mean (num_actions), then log probability, value, advantage and return. Samples are
+divided into splits, whose sums are added later in a fixed order. Sums of losses are in places 0 surrogate, 1 value, 2
+entropy, 3 asymmetry and 31 KL of `loss_partial`.
+"""
 
 import triton
 import triton.language as tl

@@ -1,4 +1,9 @@
-"""Triton kernels that add up partial sums of the gradients, and take a step of Adam."""
+"""Triton kernels that add up partial sums of the gradients, and take a step of Adam.
+
+Parameters, gradient and moments are flat vectors, the actor's part first (`jumper_warp.rl.flat`). The layers' kernels
+read a padded copy of the parameters, `weights`, in which a mirror-symmetric actor has its first layer twice; `table`
+has each parameter's places in it. Splits: parts of the samples, added in a fixed order so that results repeat bitwise.
+"""
 
 import triton
 import triton.language as tl

@@ -1,4 +1,7 @@
-"""Triton kernels of a policy step in a rollout: normalise observations, sample actions, record results."""
+"""Triton kernels of a policy step in a rollout: normalise observations, sample actions, record results.
+
+Rows are worlds. Sums about the present mean, not about 0, keep the variance exact in single precision.
+"""
 
 import triton
 import triton.language as tl
