@@ -23,7 +23,7 @@ from jumper_warp.utils.threads import available_threads
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
 MOST_SPLITS = 64  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
-SPLIT_ROWS = 256  # Smallest number of samples in a split; shorter ones cost more for their partial sums than they save
+SPLIT_ROWS = 512  # Smallest number of samples in a split; shorter ones cost more for their partial sums than they save
 MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
 _noted: list[tuple[Any, tuple, dict[str, Any]]] | None = None  # Kernels to compile, with arguments and options
