@@ -134,12 +134,15 @@ def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential
     sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last layer.
     """
     layers: list[nn.Module] = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # so that the last digits of orthogonal weights do not depend on it
     for index, (num_in, num_out) in enumerate(pairwise(sizes)):
         last = index == len(sizes) - 2
         linear = nn.Linear(num_in, num_out)
         nn.init.orthogonal_(linear.weight, out_gain if last else math.sqrt(2.0))
         nn.init.zeros_(linear.bias)
         layers += [linear] if last else [linear, ACTIVATIONS[activation]()]
+    torch.set_num_threads(threads)
     return nn.Sequential(*layers)
 
 

@@ -146,7 +146,8 @@ class DeviceStream:
 
     def __init__(self, device: torch.device) -> None:
         """Create a stream on a device of PyTorch."""
-        self._stream = wp.Stream(str(device)) if device.type == "cuda" else None
+        init_warp()
+        self._stream = wp.Stream(wp.get_device(str(device))) if device.type == "cuda" else None
         self._entered = ExitStack()
 
     def __enter__(self) -> None:

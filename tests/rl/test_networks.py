@@ -46,3 +46,16 @@ def test_act_returns_the_mean_clipped_to_1():
     model = ActorCritic(2, 1, (4,))
     torch.nn.init.constant_(model.actor[-1].bias, 3.0)  # observations of 0 give a mean of 3
     assert model.act(torch.zeros(5, 2)).tolist() == [[1.0]] * 5
+
+
+def test_initial_weights_do_not_depend_on_the_number_of_threads():
+    weights = []
+    before = torch.get_num_threads()
+    for threads in (1, 2, 4):
+        torch.set_num_threads(threads)
+        torch.manual_seed(3)
+        model = ActorCritic(147, 12, (256, 128, 128))
+        assert torch.get_num_threads() == threads
+        weights.append(torch.nn.utils.parameters_to_vector(model.parameters()))
+    torch.set_num_threads(before)
+    assert all(torch.equal(weights[0], each) for each in weights)
