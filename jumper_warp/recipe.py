@@ -19,6 +19,7 @@ from jumper_warp.rl.cfg import SESSION, TrainCfg
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json, task_to_json
+from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
@@ -39,6 +40,11 @@ class Recipe:
     noise: bool = True  # Whether observations have noise
     robot: RobotOverlay | None = None  # Values that replace the robot description's
     missing: str = ""  # Reason why the task lacks its events, whose functions were not found; empty: it has them
+
+    def __post_init__(self) -> None:
+        """Name the task in the trainer's settings. Raises InputError: a field is of another type."""
+        check_types("recipe", self)
+        object.__setattr__(self, "train", dataclasses.replace(self.train, task=self.task.name))
 
     @classmethod
     def of(cls, name: str) -> Recipe:

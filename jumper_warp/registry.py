@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.utils.assets import dashed, policy_tasks
+from jumper_warp.utils.checks import NAME, check_flags
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import existing_file
 from jumper_warp.utils.sources import PROJECT_PREFIX, module_from_file, own_fault
@@ -193,8 +194,12 @@ def register_task(
     ppo: default training settings; about: text for `jumper list` (default: the first sentence of make's docstring);
     presets: groups of flags of `jumper train` by name, as {"laptop": LAPTOP_JUMP}; replace: whether to replace a task
     of this name. A function of the same name in the same module, as of a file or a notebook's cell that runs again,
-    always replaces its task. Raises InputError: a name or alias is taken.
+    always replaces its task. Raises InputError: a name or alias is taken or invalid, or make is no function.
     """
+    check_flags(replace=replace)
+    if not callable(make) or not all(isinstance(each, str) and NAME.fullmatch(each) for each in (name, *aliases)):
+        given = f"{name!r:.40}, {make!r:.60}, aliases {aliases!r:.60}"
+        raise InputError(f"register_task needs names as for files, and a function that makes the task, got {given}")
     entry = TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about, presets=presets or {})
     _register(name, entry, replace or (name in TASKS and _is_same_function(make, TASKS[name].make)))
 
@@ -302,6 +307,8 @@ def load_task_module(name: str) -> ModuleType:
     except BaseException as error:
         TASKS.clear()
         TASKS.update(before)
+        if isinstance(error, SystemExit):
+            raise InputError(f"{name}: a file of tasks must not exit when it is imported") from error
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             raise InputError(f"no module {name!r:.80}; give a FILE.py or the name of an installed module") from error
         raise

@@ -12,6 +12,7 @@ from jumper_warp.rl import runner
 from jumper_warp.rl import seeds as several
 from jumper_warp.rl.run_folder import TrainResult
 from jumper_warp.tasks.mirror import mirror_of
+from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     from jumper_warp.rl.checkpoint import Checkpoint
@@ -28,6 +29,8 @@ def train(
     which lists the errors. Also raises InputError: the task cannot be saved, or has no mirror image and a symmetric
     policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
     """
+    if not isinstance(recipe, Recipe):
+        raise InputError(f"train needs a Recipe, such as Recipe.of(name), got {recipe!r:.60}")
     recipe.check_saving()
     cfg, task = recipe.train, recipe.task
     if seeds is not None:

@@ -89,7 +89,10 @@ def policy_info(policy: PolicySummary) -> tuple[Json, list[str]]:
 
 def _shown(path: Path) -> str:
     """Return a path relative to the working directory if it lies in it, else absolute."""
-    relative = os.path.relpath(path)
+    try:
+        relative = os.path.relpath(path)
+    except FileNotFoundError:  # the working directory was deleted
+        return str(path)
     return str(Path(path).resolve()) if relative.startswith("..") else relative
 
 

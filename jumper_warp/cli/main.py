@@ -12,6 +12,7 @@ import inspect
 import io
 import itertools
 import os
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
@@ -23,6 +24,7 @@ from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
 FAULT = 1  # Exit code for a fault of the program or the machine
+LEAST_COLUMNS = 20  # Smallest width of a terminal for which the output is laid out
 USAGE_ERROR = 2  # Exit code for input that cannot be used
 INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent with the data
 INTERRUPTED = 130  # Exit code after Ctrl-C
@@ -68,6 +70,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not args:
         print(usage(), file=sys.stderr)
         raise SystemExit(USAGE_ERROR)
+    if shutil.get_terminal_size().columns < LEAST_COLUMNS:
+        os.environ["COLUMNS"] = str(LEAST_COLUMNS)  # rich breaks lines forever in a terminal of five columns
     prepare_imports()
     run_command(lambda: dispatch(args))
 
@@ -116,9 +120,13 @@ def user_file_error(folders: Collection[str], error: Exception) -> str | None:
     """Return a message with file and line of an exception raised in a file of `folders` (absolute paths), else None.
 
     A mistake in the user's own file is invalid input, which one line explains; the project's faults keep the traceback.
+    An error that Warp raises for a function in the file, as for missing annotations, counts as the file's.
     """
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    if isinstance(error, InputError) or not frames or os.path.dirname(os.path.abspath(frames[-1][0])) not in folders:
+    if type(error).__module__.startswith("warp."):
+        while frames and os.path.dirname(frames[-1][0]) not in folders:
+            frames.pop()
+    if isinstance(error, InputError) or not frames or os.path.dirname(frames[-1][0]) not in folders:
         return None
     return f"{os.path.basename(frames[-1][0])}:{frames[-1][1]}: {type(error).__name__}: {error}"
 
@@ -212,11 +220,13 @@ def run_command(command: Callable[[], object]) -> None:
         print_error(str(error))
         raise SystemExit(USAGE_ERROR) from None
     except OSError as error:
-        if error.filename is None and error.errno != errno.ENOSPC:
+        no_folder = "temporary directory" in str(error)  # of Python's tempfile, which names those that it tried
+        if error.filename is None and error.errno != errno.ENOSPC and not no_folder:
             raise
-        if error.filename is None:
+        if error.filename is None and not no_folder:
             discard_output()
-        print_error(f"{error.filename or 'standard output'}: {error.strerror}")
+        place = error.filename or ("TMPDIR" if no_folder else "standard output")
+        print_error(f"{place}: {error.strerror}")
         raise SystemExit(USAGE_ERROR) from None
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):

@@ -229,7 +229,7 @@ def excite(cfg: ExciteCfg) -> None:
 def characterise(cfg: ActuatorCfg) -> None:
     """Fit one motor's constants to test-bench data, print them with 95 % intervals, write actuator.json.
 
-    Raises as `run`.
+    Exits with code 3 if the fit is not consistent with the data and a motor of this kind. Raises as `run`.
     """
     from jumper_warp.identification.actuators import characterise_motor, load_bench
     from jumper_warp.utils.output import output_dir
@@ -240,7 +240,13 @@ def characterise(cfg: ActuatorCfg) -> None:
     write_atomically(folder / "actuator.json", content)
     if cfg.json:
         print(content.decode(), end="")
-        return
-    for name, (value, low, high, unit) in result.rows().items():
-        print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
-    print(folder / "actuator.json")
+    else:
+        for name, (value, low, high, unit) in result.rows().items():
+            note = ", not identified" if name in result.open else ""
+            print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}{note}")
+        print(f"χ² {result.chi2:.4g}")
+        print(folder / "actuator.json")
+    if result.inconsistency:
+        advice = "check sign, unit and noise of the torque"
+        print(f"jumper: not consistent: {result.inconsistency}; {advice}", file=sys.stderr)
+        raise SystemExit(INCONSISTENT)

@@ -212,6 +212,8 @@ def _numbers(name: str, values: Any, width: int) -> np.ndarray:
     """Return a number or an array as (width,) float32. Raises InputError: it is of another size, or not finite."""
     try:
         with np.errstate(over="ignore"):
+            if np.ma.is_masked(values):
+                raise TypeError("some values are masked")
             array = np.atleast_1d(np.asarray(values))
             if array.dtype.kind not in "fiub":
                 raise TypeError(f"values of type {array.dtype}")

@@ -30,7 +30,7 @@ from jumper_warp.robot.motors import (
 from jumper_warp.sim.dynamics import JumperDynamics, WorldRange, check_step, slices_of
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_within
+from jumper_warp.utils.checks import check_flags, check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
@@ -117,6 +117,7 @@ class Rollout(Uncopied):
         tolerance: float | None = None,
         threads: int | None = None,
     ):
+        check_flags(double=double)
         substeps = check_step(dt, substeps)
         every = substeps if every is None else every
         if every not in range(1, substeps + 1) or substeps % every != 0:

@@ -41,6 +41,10 @@ saturation: limit on the commanded torque; peak: torque limit below cutoff_speed
 no_load_speed; fade_start, fade_end: speeds between which all torque fades to 0; time_constant: of the current loop."""
 
 
+LARGEST_CHI2 = 10.0  # Largest mean squared error over the noise of a fit that is consistent
+MOST_DEVIATIONS = 5.0  # Largest plausible distance of a constant from the described one, in deviations of the prior
+
+
 @dataclass(frozen=True, eq=False)
 class Bench:
     """Test-bench recording of a motor's commanded torque, speed and measured torque, n rows.
@@ -129,6 +133,20 @@ class Actuator:
     intervals: Mapping[str, tuple[float, float]]  # 95 % intervals, wider where the law does not fit the data
     open: tuple[str, ...]  # Names of the constants whose standard deviation is above half the prior's: not identified
     chi2: float  # [1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise
+    deviations: Mapping[str, float]  # Distance from the described constants, in standard deviations of the prior
+
+    @property
+    def inconsistency(self) -> str:
+        """Reasons why the fit cannot be trusted, one line; empty if there are none.
+
+        A wrong sign or unit of the torque, or a dead sensor, gives constants far from those of any motor of this kind.
+        """
+        reasons = [f"χ² {self.chi2:.4g} above {LARGEST_CHI2:g}"] if not self.chi2 <= LARGEST_CHI2 else []
+        for name, distance in self.deviations.items():
+            if abs(distance) > MOST_DEVIATIONS:
+                value = f"{name} {self.constants[name]:.3g} {PRIORS[name][1]}"
+                reasons.append(f"{value} is {abs(distance):.3g} standard deviations from the described one")
+        return ", ".join(reasons)
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
         """Return a motor's identified constants by name, each as (value, low, high, unit) with its 95 % interval."""
@@ -140,7 +158,7 @@ class Actuator:
             name: {"value": value, "interval_95": [low, high], "unit": unit, "identified": name not in self.open}
             for name, (value, low, high, unit) in self.rows().items()
         }
-        return {"motor": self.kind, "chi2": self.chi2, "constants": rows}
+        return {"motor": self.kind, "chi2": self.chi2, "consistent": not self.inconsistency, "constants": rows}
 
 
 def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, float]:
@@ -162,7 +180,8 @@ def characterise_motor(
     """Identify limits, friction and latency of a motor from a bench recording by least squares.
 
     kind: motor whose described constants are the prior's means. torque_noise [N m]: standard deviation of the torque
-    sensor. Raises InputError: noise that is not positive, or a command that never changes.
+    sensor. Raises InputError: noise that is not positive, a command that never changes, or data that identifies no
+    constant.
     """
     check_within("torque noise", np.array([torque_noise]), (1.0e-6, 100.0))
     if np.ptp(bench.command) == 0.0:
@@ -196,4 +215,8 @@ def characterise_motor(
         for (name, value), p, d in zip(values.items(), prior_std, std, strict=True)
     }
     unknown = tuple(name for name, d in zip(names, std, strict=True) if d > 0.5)
-    return Actuator(kind, values, intervals, unknown, chi2=float(np.mean(errors**2)))
+    deviations = dict(zip(names, map(float, best.x), strict=True))
+    result = Actuator(kind, values, intervals, unknown, float(np.mean(errors**2)), deviations)
+    if len(unknown) == len(names) and not result.inconsistency:
+        raise InputError("bench: the data identifies none of the motor's constants: does the motor turn and push?")
+    return result

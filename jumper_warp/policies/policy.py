@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -220,7 +221,9 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
         state = {"config": config, "saved": checkpoints.load_foreign_checkpoint(path)}
         read = _policy_of_rsl_rl
     elif path.suffix != ".pt" and newest:
-        path, state, *_ = checkpoints.latest_checkpoint(path / CHECKPOINTS)
+        path, state, skipped, _ = checkpoints.latest_checkpoint(path / CHECKPOINTS)
+        for reason in skipped:
+            print(f"skipped: {reason}", file=sys.stderr)
     else:
         path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
         state = checkpoints.load_checkpoint(path)

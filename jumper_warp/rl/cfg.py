@@ -16,6 +16,7 @@ from jumper_warp.utils.checks import (
     check_flag_fields,
     check_not_negative,
     check_seed,
+    check_types,
 )
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
@@ -95,7 +96,9 @@ class PpoCfg:
     older GPUs and CPUs use PyTorch."""
 
     def __post_init__(self) -> None:
-        """Raise InputError (a ValueError) if a setting of PPO is out of range."""
+        """Raise InputError (a ValueError) if a setting of PPO is of another type or out of range."""
+        object.__setattr__(self, "hidden", tuple(self.hidden) if isinstance(self.hidden, list) else self.hidden)
+        check_types("ppo", self)
         check_bounds("ppo", self, PPO_BOUNDS)
         check_flag_fields(self)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
@@ -184,6 +187,7 @@ class TrainCfg:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
         check_flag_fields(self)
+        check_types("training:", self)
         object.__setattr__(self, "num_envs", check_count("num_envs", self.num_envs))
         for name in ("max_iterations", "log_interval", "save_interval", "max_checkpoints"):
             object.__setattr__(self, name, check_count(name, getattr(self, name), MOST_ITERATIONS))
@@ -193,9 +197,10 @@ class TrainCfg:
         object.__setattr__(self, "seeds", tuple(check_seed(seed) for seed in self.seeds))
         if len(set(self.seeds)) < len(self.seeds):
             raise InputError(f"seeds must be distinct, got {self.seeds}")
-        for name in (self.run_name, *self.tags):
+        for name in (self.task, self.run_name, *self.tags):
             if name is not None and not NAME.fullmatch(name):
-                raise InputError(f"run_name and tags may contain letters, digits, _ . - and spaces, got {name!r:.60}")
+                allowed = "letters, digits, _ . - and spaces"
+                raise InputError(f"task, run_name and tags may contain {allowed}, got {name!r:.60}")
         if self.trainer not in ("ppo", "rsl-rl"):
             raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):

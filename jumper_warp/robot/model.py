@@ -24,7 +24,7 @@ from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.legs import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.utils.checks import check_count
+from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.runtime import init_warp
@@ -94,6 +94,7 @@ def build_model(
             unknown `ground`.
     """
     num_worlds = check_count("num_worlds", num_worlds)
+    check_flags(visuals=visuals, mujoco=mujoco)
     if not isinstance(friction, Real) or not 0.0 <= friction <= MAX_FRICTION:
         raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction!r:.40}")
     check_gravity(gravity)

@@ -20,7 +20,7 @@ from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
 
@@ -59,6 +59,7 @@ class MotorKindCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is outside its range in MOTOR_BOUNDS, or no_load_speed is too low."""
+        check_types("motor", self)
         check_bounds("motor", self, MOTOR_BOUNDS)
         if self.no_load_speed <= self.cutoff_speed:
             raise InputError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
@@ -77,6 +78,7 @@ class MotorCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError unless the over-speed protection has speeds 0 <= fade_start < fade_end <= MAX_FADE."""
+        check_types("motors", self)
         if not 0.0 <= self.fade_start < self.fade_end <= MAX_FADE:
             speeds = f"{self.fade_start}, {self.fade_end}"
             raise InputError(f"need 0 <= fade_start < fade_end <= {MAX_FADE:g} rad/s, got {speeds}")

@@ -102,7 +102,8 @@ class Recording:
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
         arrays["header"] = np.array(json.dumps(header))
-        arrays["series"] = np.array(list(self.series.values()), dtype=np.float64).reshape(len(self.series), -1)
+        series = np.array(list(self.series.values()), dtype=np.float64)
+        arrays["series"] = series.reshape(len(self.series), -1 if self.series else 0)
         for index, shape in enumerate(self.shapes):
             arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
         data = io.BytesIO()

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from jumper_warp import Simulation, build_model, load_policy, make_task
+from jumper_warp import Recipe, Simulation, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.policies.catalog import ONNX, add_files
 from jumper_warp.policies.policy import save_policy
+from jumper_warp.registry import register_task
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.recorder import Recorder
+from jumper_warp.viz.recording import load_npz
 
 POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
@@ -100,3 +106,68 @@ def test_a_policy_holds_files_of_its_folder_only(name, tmp_path: Path):
     with pytest.raises(InputError, match="cannot hold"):
         save_policy(tmp_path / "other", load_policy("vertical_jump"), files={name: b""})
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["epochs", "minibatches", "num_steps", "gamma", "clip", "lr", "hidden"])
+@pytest.mark.parametrize("value", [1.5 + 0j, None, "1e-4", (True,)])
+def test_settings_of_ppo_have_their_type(name, value):
+    with pytest.raises(InputError, match=f"ppo {name}"):
+        PpoCfg(**{name: value})
+
+
+def test_whole_numbers_of_ppo_are_integers():
+    with pytest.raises(InputError, match="ppo epochs must be int"):
+        PpoCfg(epochs=1.5)
+    assert PpoCfg(hidden=[64, 32]).hidden == (64, 32)
+
+
+@pytest.mark.parametrize("name", ["kp", "kd", "peak"])
+def test_constants_of_a_motor_are_numbers(name):
+    with pytest.raises(InputError, match=f"motor {name}"):
+        dataclasses.replace(jumping_motors().lateral, **{name: None})
+
+
+def test_the_task_of_a_recipe_names_its_training():
+    recipe = Recipe(make_task("horizontal-jump"), TrainCfg(num_envs=8))
+    assert recipe.train.task == "horizontal-jump"
+    with pytest.raises(InputError, match="recipe task"):
+        Recipe("vertical-jump")
+    with pytest.raises(InputError, match="needs a Recipe"):
+        train("vertical-jump")
+    with pytest.raises(InputError, match="task, run_name and tags"):
+        TrainCfg(task="../outside")
+
+
+@pytest.mark.parametrize(
+    "arguments", [("mine", 3), ("mine", None), (None, make_task), ("a/b", make_task), ("mine", make_task, ("",))]
+)
+def test_a_task_is_registered_by_names_and_a_function(arguments):
+    name, make, *aliases = arguments
+    with pytest.raises(InputError, match="register_task needs names"):
+        register_task(name, make, aliases=aliases[0] if aliases else ())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: register_task("mine", make_task, replace="no"),
+        lambda: Rollout(build_model(1), double="no"),
+        lambda: build_model(1, visuals="no"),
+    ],
+)
+def test_switches_are_bools(call):
+    with pytest.raises(InputError, match="must be True or False"):
+        call()
+
+
+def test_a_recording_without_series_is_written(tmp_path: Path):
+    model = build_model(1)
+    recorder = Recorder(model)
+    recorder.record(0.0, model.state().body_q)
+    assert load_npz(recorder.save_npz(tmp_path / "recording.npz")).series == {}
+
+
+def test_masked_readings_are_refused():
+    policy = DeployedPolicy(POLICY / ONNX)
+    with pytest.raises(InputError, match="angle must be numbers"):
+        policy.filter_targets(ZEROS, np.ma.masked_array(ZEROS, mask=True), ZEROS)

@@ -384,3 +384,19 @@ def redirected(redirection, *args, **environment):
 def test_closed_streams_exit_with_0(redirection):
     done = redirected(redirection, "list")
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("columns", ["1", "5"])
+def test_help_ends_in_a_narrow_terminal(columns):
+    environment = os.environ | {"COLUMNS": columns}
+    command = [sys.executable, "-m", "jumper_warp", "list", "--help"]
+    subprocess.run(command, env=environment, check=True, capture_output=True, timeout=300)
+
+
+def test_info_works_in_a_deleted_folder(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    run_info = "from jumper_warp.cli.main import main; main(['info', 'vertical_jump'])"
+    code = f"import os; os.rmdir({str(gone)!r}); {run_info}"
+    done = subprocess.run([sys.executable, "-c", code], cwd=gone, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Traceback" not in done.stderr

@@ -201,6 +201,9 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:7: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
+        ("import warp as wp\n", "import warp as wp\nraise SystemExit(0)\n", "must not exit when it is imported"),
+        ("robot: mdp.RobotView, state: Any, scale: float", "robot, state, scale",
+         "own_faults.py:12: WarpCodegenError: Incomplete argument annotations"),
         ("tilt(robot)", "tilt(robot.quad)", "function level: `quad` is not an attribute of"),
         ("tilt(robot)", "tlt(robot)", "own_faults.py:{use}, function level: "),
         ('task, name="own', 'task, action_scale=15.0, name="own',

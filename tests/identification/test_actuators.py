@@ -1,6 +1,8 @@
 """Identification of motor constants from a synthetic test bench with known constants."""
 
+import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -58,6 +60,23 @@ def test_constants_beyond_the_tested_speeds_stay_open():
     assert not {"saturation", "friction", "latency"} & set(actuator.open)
     prior_mean = described_constants("transversal")["no_load_speed"]
     assert actuator.constants["no_load_speed"] == pytest.approx(prior_mean, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("torque", "reason"),
+    [(lambda x: -x, "χ²"), (lambda x: 0.0 * x, r"(peak|saturation) .* standard deviations"), (lambda x: 1.3 * x + 5.0, "χ²")],
+)
+def test_a_wrong_sign_a_dead_sensor_and_an_offset_are_not_consistent(torque, reason):
+    bench = synthetic_bench(TRUTH, np.random.default_rng(0))
+    assert not characterise_motor(bench).inconsistency
+    wrong = characterise_motor(dataclasses.replace(bench, torque=torque(bench.torque)))
+    assert re.search(reason, wrong.inconsistency) and not wrong.to_json()["consistent"]
+
+
+def test_data_that_identifies_nothing_is_refused():
+    bench = synthetic_bench(TRUTH, np.random.default_rng(0))
+    with pytest.raises(InputError, match="identifies none"):
+        characterise_motor(bench, torque_noise=100.0)
 
 
 def test_load_bench_reads_csv_and_refuses_bad_files(tmp_path):
