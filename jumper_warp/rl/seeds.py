@@ -8,6 +8,7 @@ the results of a seed are bitwise those of a single training with this seed.
 from __future__ import annotations
 
 import dataclasses
+import math
 import statistics
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -26,6 +27,7 @@ from jumper_warp.rl.run_names import SEED
 from jumper_warp.rl.runner import MakeEnv, TrainingRun, finish, iterate, leave_process_group, lock, prepare
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
+from jumper_warp.utils.metrics import mean
 from jumper_warp.utils.runtime import DeviceStream
 
 
@@ -117,9 +119,15 @@ def _total(folder: Path, results: dict[int, TrainResult]) -> TrainResult:
 
 
 def table(results: dict[int, TrainResult], metric: str) -> list[str]:
-    """Return lines with the last value of a metric and the mean reward of each seed."""
+    """Return lines with the last value of a metric and the mean reward of each seed, and their means over the seeds.
+
+    In brackets: 95 % bootstrap interval of the mean.
+    """
     lines = [f"seed   {metric.removeprefix('Metrics/'):>10}   reward   iteration"]
     for seed, result in results.items():
         numbers = (result.metrics.get(name, float("nan")) for name in (metric, "Train/mean_reward"))
         lines.append("{:<6} {:>10.3f} {:>8.2f} {:>11}".format(seed, *numbers, result.iteration))
+    measured = mean([result.metrics.get(metric, math.nan) for result in results.values()])
+    if len(results) > 1 and measured.interval is not None:
+        lines.append("mean   {:>10.3f} [{:.3f}, {:.3f}]".format(measured.value, *measured.interval))
     return lines

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from jumper_warp.rl import seeds
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.rl.torch.ppo import Ppo
@@ -182,3 +183,10 @@ def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
         shutil.copyfile(folder / "iteration_000004.pt", cfg.log_root / "whole.pt")
     join(rank, ports[1])
     train(dataclasses.replace(cfg, resume=str(folder / "iteration_000002.pt")), make)
+
+
+def train_seeds_rank(rank: int, port: int, cfg: TrainCfg) -> None:
+    """Train the seeds of one of two processes."""
+    join(rank, port)
+    seeds.train(cfg, PushTask)
+    assert not torch.distributed.is_initialized()

@@ -64,7 +64,11 @@ def test_constants_beyond_the_tested_speeds_stay_open():
 
 @pytest.mark.parametrize(
     ("torque", "reason"),
-    [(lambda x: -x, "χ²"), (lambda x: 0.0 * x, r"(peak|saturation) .* standard deviations"), (lambda x: 1.3 * x + 5.0, "χ²")],
+    [
+        (lambda x: -x, "χ²"),
+        (lambda x: 0.0 * x, r"(peak|saturation) .* standard deviations"),
+        (lambda x: 1.3 * x + 5.0, "χ²"),
+    ],
 )
 def test_a_wrong_sign_a_dead_sensor_and_an_offset_are_not_consistent(torque, reason):
     bench = synthetic_bench(TRUTH, np.random.default_rng(0))

@@ -16,7 +16,7 @@ from jumper_warp.rl.resume import FROZEN, find_checkpoints
 from jumper_warp.rl.run_names import best_score, run_name, seed_folders, title
 from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
 from jumper_warp.utils.errors import InputError
-from toy_task import PushTask, equal, push_cfg
+from toy_task import PushTask, equal, free_port, push_cfg, train_seeds_rank
 
 
 class SeededTask(PushTask):
@@ -63,6 +63,18 @@ def test_resume_continues_all_seeds_bitwise(cfg):
         ours, theirs = state(folder), state(again.folder / f"seed_{seed}")
         assert equal(ours["ppo"], theirs["ppo"]) and equal(ours["env"], theirs["env"])
         assert torch.equal(ours["rng"]["learner"], theirs["rng"]["learner"])
+
+
+def test_two_processes_share_the_seeds_without_changing_their_results(cfg, tmp_path):
+    shared = dataclasses.replace(cfg, log_root=tmp_path / "shared", threads=1)
+    torch.multiprocessing.spawn(train_seeds_rank, (free_port(), shared), nprocs=2)
+    (run,) = shared.log_root.glob("push/*")
+    alone = seeds.train(dataclasses.replace(cfg, threads=1), PushTask)
+    assert list(seed_folders(run)) == [1, 4, 7]
+    for seed, folder in seed_folders(run).items():
+        assert equal(state(folder)["ppo"], state(alone.folder / f"seed_{seed}")["ppo"])
+    with pytest.raises(InputError, match="2 processes need as many seeds, got 1"):
+        dataclasses.replace(cfg, seeds=(1,)).check_processes(2)
 
 
 def test_resume_takes_the_last_iteration_that_all_seeds_have(cfg):
@@ -145,6 +157,7 @@ def test_progress_shows_mean_and_interval_over_seeds(cfg, capsys):
     line = next(line for line in err if line.startswith("iteration 4/4, 0.01 M steps: "))
     assert " reward " in line and " success " in line and line.count("[") == 2
     assert sum(line.startswith(("1 ", "4 ", "7 ")) for line in err) == 3  # the table at the end
+    assert err[-1].startswith("mean ")
 
 
 def test_name_of_a_run_is_in_its_folder_and_its_title(cfg):
