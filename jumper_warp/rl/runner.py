@@ -1,52 +1,26 @@
-"""Training loop: one process per device, with logging, checkpoints, interruption by signal, and resuming."""
+"""Training loop of one run, or of several side by side; one process per device, interruption by signal."""
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl import distributed, resume
-from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
+from jumper_warp.rl.actor_init import ActorInit
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
-from jumper_warp.rl.clock import TrainingClock, is_last_iteration
+from jumper_warp.rl.checkpoint import Checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.fused import make_ppo
-from jumper_warp.rl.learner import STATISTICS
-from jumper_warp.rl.logger import NoLog, Scores, SeedConsole, Stopwatch, TrainingConsole, TrainingLog
-from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.run_folder import (
-    CONFIG,
-    INTERRUPTED,
-    AsRslRl,
-    TrainResult,
-    full_config,
-    new_folder,
-    report_non_finite,
-    rescue_folder,
-    write_config,
-)
-from jumper_warp.rl.run_names import CHECKPOINTS, SEED
+from jumper_warp.rl.run_folder import INTERRUPTED, AsRslRl, TrainResult
+from jumper_warp.rl.run_names import CHECKPOINTS
 from jumper_warp.rl.stop_request import StopRequest
+from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.threads import set_threads
 
-PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
-"""Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
-LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
-"""Learning metrics in addition to the losses; those of Train/ exist only if an episode has ended."""
-WARM_UP = 5.0  # [s] A first iteration that takes longer measures the speed of a training on a CPU
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Function that makes an environment from the number of worlds, the seed and the device."""
 
@@ -150,246 +124,3 @@ def leave_process_group() -> None:
     """Leave torch's process group, if this process is in one."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
-
-
-class TrainingRun:
-    """State of a training in this process: algorithm, environment, folder, iteration, time."""
-
-    def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None, expected_rate: float = 0.0, *, folder: Path | None = None,
-        console: TrainingConsole | SeedConsole | None = None, stream: AbstractContextManager[None] | None = None,
-    ) -> None:  # fmt: skip
-        """Build the algorithm, and load the checkpoint, else apply `actor_init` if given.
-
-        command, actor_init, checkpoint, expected_rate: as in `train`. folder: of a new run (default: a new one, by
-        time). console: shows lines and progress (default: a new one). stream: context in which all work of the run is
-        enqueued (default: the current stream). Raises InputError or CheckpointError as `train`.
-        """
-        self.cfg, self.env, self.rank = cfg, env, rank
-        self._command = command or f"jumper train {cfg.task}"
-        self.stream = nullcontext() if stream is None else stream
-        self.ppo = make_ppo(env, cfg.ppo)
-        losses = {f"Loss/{name}" for name in STATISTICS}
-        logged = {*env.metrics(), *losses, *LEARNING, *PERF}
-        if cfg.best_metric not in logged:
-            examples = ", ".join(sorted(name for name in logged if name.startswith(("Metrics/", "Train/"))))
-            raise InputError(f"best_metric must name a logged metric, such as {examples}, got {cfg.best_metric!r:.60}")
-        self.config = full_config(cfg, env, rank)
-        self.iteration = 0
-        self.ended = False
-        self.clock = TrainingClock(cfg)
-        self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
-        self.metrics: dict[str, float] = {}
-        self._scores = Scores(cfg.best_metric)
-        self.notes: list[str] = []
-        self.failure = ""  # Reason why the training ends with exit status 1; empty: none
-        self._is_finite = True  # Whether the weights are finite, else they are not saved
-        if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
-            raise InputError("the processes found different checkpoints: log_root must be a folder shared by all")
-        if actor_init is not None and checkpoint is None:
-            apply_actor_init(actor_init, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
-            self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", actor_init.change))))
-        self.ppo.generator.manual_seed(cfg.seed + 1 + rank.index)
-        if checkpoint is not None:
-            self.folder = self._resume(checkpoint)
-        elif folder is not None:
-            self.folder = folder
-            folder.mkdir(parents=True)
-        else:
-            self.folder = new_folder(cfg, rank)
-        if console is None:
-            self.notes.insert(0, f"run {self.folder}")
-            console = TrainingConsole(cfg, self.iteration, expected_rate)
-        self._console = console
-        if rank.index == 0:
-            write_config(self.folder, self.config)
-
-    def _resume(self, checkpoint: Checkpoint) -> Path:
-        """Restore networks, environment and random generators from a checkpoint; return its run's folder.
-
-        Raises CheckpointError: it does not fit the settings.
-        """
-        path, state, skipped, _ = checkpoint
-        changed = resume.changed_settings(state, self.config)
-        lines = [f"{name} {change}" for name, change in changed.items()]
-        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *lines]
-        self.notes += resume.changed_user_files(state, self.config)
-        try:
-            resume.check_changes(changed, self.config)
-            local = resume.rank_state(state, self.rank)
-            self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
-            self.env.load_state_dict(local["env"])
-            self.clock.seconds = resume.saved_seconds(state)
-            resume.set_random_state(local["rng"], self.ppo.generator)
-        except DECODE_ERRORS as error:
-            suffix = f" ({', '.join(lines)})" if lines else ""
-            raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
-        if "ppo.lr" in changed:
-            self.ppo.lr.fill_(self.cfg.ppo.lr)
-        self.iteration = state["iteration"]
-        self.config["train"]["init_policy"] = resume.saved_init_policy(state)
-        return path.parent.parent
-
-    @contextmanager
-    def open(self) -> Iterator[None]:
-        """Context in which the training can iterate: kernels are compiled, the log is open."""
-        with self.stream, ThreadPoolExecutor(1) as pool:
-            kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
-            distributed.local_rank_zero_first(self.ppo.compile)
-            kernels.result()
-            if self.iteration == 0:
-                self.env.reset()
-        self._begin, self._first_iteration = time.perf_counter(), self.iteration + 1
-        self._seconds = 0.0
-        self._watch = Stopwatch(self.rank.device)
-        with self._open_log() as self.log:
-            for note in self.notes:
-                self.log.print_line(note)
-            self.ended = is_last_iteration(self.iteration, self.cfg, self.clock.is_over_time())
-            if self.ended:
-                complete = f"the training is complete at iteration {self.iteration}"
-                self.log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
-            yield
-
-    def collect(self) -> None:
-        """Enqueue the rollout of an iteration on the device."""
-        self._watch.start()
-        self.ppo.set_progress(self.clock.progress(self.iteration))
-        self.ppo.collect()
-        self._mark()
-
-    def update(self) -> None:
-        """Enqueue the update of an iteration on the device."""
-        self.ppo.update()
-        self._mark()
-
-    def conclude(self, stop: StopRequest, ends: bool) -> None:
-        """Count the iteration that was enqueued; log and save it where it is due. ends: whether it is the last one."""
-        cfg, log, watch = self.cfg, self.log, self._watch
-        self.iteration += 1
-        if self.iteration == self._first_iteration:
-            self.clock.start(self.rank.device)
-        is_last = is_last_iteration(self.iteration, cfg, ends)
-        saves = self.iteration % cfg.save_interval == 0
-        logs = saves or self.iteration % cfg.log_interval == 0  # a checkpoint's score is of its last iterations
-        if is_last or logs or saves or cfg.stop_on_nan:
-            self._check()
-            is_last = is_last or bool(self.failure and self.rank.size == 1)
-        if is_last or logs:
-            (times, seconds), self._is_timed = watch.read(), True
-            self.metrics = self._read_metrics(times)
-            self._scores.add(self.metrics)
-            log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
-        elif self.iteration == self._first_iteration or not self._is_timed:
-            self._print_speed(self.iteration == self._first_iteration)
-        if is_last and not self.failure and not self._console.brief:
-            log.print_line(f"ended by {self.reason(stop)}")
-        if (is_last or saves) and self._is_finite:
-            self._save(is_last, stop)
-        self._seconds = time.perf_counter() - self._begin
-        self.ended = is_last
-
-    def result(self) -> TrainResult:
-        """Return the training's result so far."""
-        return TrainResult(self.folder, self.iteration, self._seconds, self.metrics, {})
-
-    def _open_log(self) -> TrainingLog | NoLog:
-        """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
-        if self.rank.index != 0:
-            return NoLog()
-        return TrainingLog(self.folder, self.config, self.cfg, self.iteration, self._console)
-
-    def _steps(self) -> int:
-        """Return the number of environment steps in an iteration, of all worlds."""
-        return self.cfg.ppo.num_steps * self.cfg.num_envs
-
-    def reason(self, stop: StopRequest) -> str:
-        """Return a text about why the training ends, with the steps made if they are not all."""
-        done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
-        steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
-        return f"{'an interruption' if stop.requested else self.clock.limit(self.iteration)}{steps}"
-
-    def _mark(self) -> None:
-        """Mark the end of a part of an iteration for timing; warn of a low step rate in a long first iteration."""
-        self._watch.mark()
-        if not self.clock.started and (seconds := self._watch.lap_time()) > WARM_UP:
-            self.log.check_rate(self._steps() / seconds)
-
-    def _print_speed(self, is_first: bool) -> None:
-        """Print a CPU's training speed; the first iteration counts only if it takes much longer than warm-up."""
-        times, seconds = self._watch.read()
-        if not self._is_timed and (seconds > WARM_UP or not is_first):
-            self.log.print_speed(self._steps() / sum(times), self.clock.remaining(self.iteration, seconds))
-            self._is_timed = True
-
-    def _check(self) -> None:
-        """Report NaN and infinite terms; set `failure` if one, the weights or a deleted run folder end the training."""
-        folder, log, print_line = self.folder, self.log, partial(print, file=sys.stderr)
-        if isinstance(log, TrainingLog):
-            print_line = log.print_line
-            self.folder, failure = rescue_folder(folder, self.config, (CONFIG, METRICS_FILE))
-            self.failure = self.failure or failure
-            if self.folder != folder:
-                log.move(self.folder)
-        self._is_finite = self.ppo.is_finite()
-        if not self._is_finite:
-            self.failure = self.failure or "the weights are not finite; the last checkpoint is the one before"
-        found = report_non_finite(self.env, self.folder, self.config, self.iteration, print_line, self.rank.index)
-        if found and self.cfg.stop_on_nan:
-            self.failure = self.failure or f"--stop-on-nan: {found[0]}"
-
-    def is_end_requested(self, stop: StopRequest) -> bool:
-        """Return whether to end the training: a process has a stop request, a failure, or reached the time limit.
-
-        Several processes synchronise this, `stop.requested` and `failure` only in logged iterations.
-        """
-        over_time = self.clock.is_over_time()
-        failed = bool(self.failure)
-        if distributed.world_size() > 1:
-            if self.iteration % self.cfg.log_interval:
-                return False
-            flags = distributed.all_reduce_max([int(stop.requested), int(over_time), int(failed)])
-            stop.requested, over_time, failed = map(bool, flags)
-            self.failure = self.failure or ("another process has failed" if failed else "")
-        return stop.requested or over_time or failed
-
-    def _read_metrics(self, times: list[float]) -> dict[str, float]:
-        """Return the metrics to log; times: of rollout and update [s], as in PERF."""
-        perf = (self._steps() / sum(times), *times, self.clock.elapsed())
-        return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
-
-    def _save(self, is_last: bool, stop: StopRequest) -> None:
-        """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one.
-
-        It also holds the states of the other ranks' environments, so that a resumed training continues identically.
-        """
-        seconds = self.clock.elapsed()
-        local = {
-            "ppo": self.ppo.state_dict(),
-            "env": self.env.state_dict(),
-            "rng": resume.random_state(self.ppo.generator),
-        }
-        others = distributed.other_states(local, self.rank)
-        if self.rank.index != 0:
-            return
-        state = {"iteration": self.iteration, "seconds": seconds, **local, "others": others}
-        state["config"] = json.dumps(self.config)
-        folder = self.folder / CHECKPOINTS
-        try:
-            path = save_checkpoint(folder, state, self._scores.mean(), self.cfg.max_checkpoints)
-        except OSError as error:
-            if is_last:
-                raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
-            self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
-            return
-        self._scores.clear()
-        if is_last and not self._console.brief:
-            hint = f", continue with: {self.resume_command}"
-            self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
-
-    @property
-    def resume_command(self) -> str:
-        """Command line that resumes this run, with all its seeds."""
-        folder = self.folder.parent if self.folder.name.startswith(SEED) else self.folder
-        return f"{self._command} --resume {shlex.quote(str(folder))}"

@@ -24,7 +24,8 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import SeedsConsole
 from jumper_warp.rl.run_folder import TrainResult, new_folder
 from jumper_warp.rl.run_names import SEED
-from jumper_warp.rl.runner import MakeEnv, TrainingRun, finish, iterate, leave_process_group, lock, prepare
+from jumper_warp.rl.runner import MakeEnv, finish, iterate, leave_process_group, lock, prepare
+from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.metrics import mean

@@ -15,7 +15,7 @@ from jumper_warp.gym import env_id
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
-from jumper_warp.rl.runner import LEARNING, PERF
+from jumper_warp.rl.training_run import LEARNING, PERF
 from jumper_warp.tasks.randomization import RandomizationCfg
 from toy_task import SMALL
 

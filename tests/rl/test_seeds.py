@@ -13,8 +13,9 @@ from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
 from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import FROZEN, find_checkpoints
+from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.run_names import best_score, run_name, seed_folders, title
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
+from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, equal, free_port, push_cfg, train_seeds_rank
 

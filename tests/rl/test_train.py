@@ -18,7 +18,9 @@ from jumper_warp.rl.logger import Scores
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.rsl_rl import train_rsl_rl
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, TrainingRun, train
+from jumper_warp.rl.run_folder import CONFIG
+from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 

@@ -9,7 +9,8 @@ import torch
 from jumper_warp.rl.checkpoint import CheckpointError, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.resume import find_checkpoints
-from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, iterate, train
+from jumper_warp.rl.runner import CHECKPOINTS, iterate, train
+from jumper_warp.rl.training_run import TrainingRun
 from test_train import final_state
 from toy_task import SMALL, PushTask, push_cfg
 
