@@ -20,6 +20,7 @@ from jumper_warp.identification.results import starts_agree
         (100, 0.0, 1.0, 124.342 / 100),  # tables of the χ² distribution at 5 %
         (100, 0.0, 2.0, 67.505 / 50),  # as 50 independent values
         (110, 10.0, 1.0, 124.342 / 110),
+        (10, 0.0, 40.0, 3.84146),  # as one value, although they vary as a quarter of one
     ],
 )
 def test_chi2_limit_is_that_of_chi2_tables(count, fitted, correlation, limit):
