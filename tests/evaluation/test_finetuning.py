@@ -10,7 +10,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
-from jumper_warp.evaluation.jump_errors import jump_errors
+from jumper_warp.evaluation.jump_errors import ballistic_landing, jump_errors
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
@@ -117,6 +117,18 @@ def test_landing_errors_on_mars_are_measured_at_rest():
     arrays = group.env.task_arrays()
     assert errors.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
     assert errors.value.abs().max() < 0.05  # [m]
+
+
+def test_ballistic_landing_is_where_a_projectile_on_mars_falls_to_0_3_m():
+    policy, rng = Policy.load("mars_horizontal_jump"), np.random.default_rng(0)
+    (group,) = make_groups(policy.recipe(), FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
+    pos, vel = rng.uniform(0.5, 1.5, (2, 4, 3))  # [m], [m/s]; without rotation, the com and the base move alike
+    state = group.loop.state()
+    state.q[:3], state.qd[:3], state.qd[3:] = torch.as_tensor(pos.T), torch.as_tensor(vel.T), 0.0
+    landing = ballistic_landing(group.loop, [state], torch.zeros(4, dtype=torch.int64))
+    time = [np.roots([-0.5 * 3.71, up, height - 0.3]).max() for up, height in zip(vel[:, 2], pos[:, 2], strict=True)]
+    expected = pos + vel * np.array(time)[:, None]
+    np.testing.assert_allclose(torch.stack(landing).numpy(), expected[:, :2].T, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", [0, 5])

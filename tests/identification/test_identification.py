@@ -12,7 +12,7 @@ from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
 from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
-from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
+from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, ratio, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
@@ -233,6 +233,12 @@ def test_normalised_inverts_values():
     parameters = jumper_parameters()
     z = np.random.default_rng(0).normal(size=(3, len(parameters)))
     np.testing.assert_allclose(parameters.normalised(parameters.values(z)), z, atol=1e-9)
+
+
+@pytest.mark.parametrize(("prior", "factor"), [(0.2, math.e), (0.6, 10.0)])
+def test_bounds_of_a_ratio_are_five_standard_deviations_and_at_most_tenfold(prior, factor):
+    bounds = ratio("f", "paw_friction", (0,), "1", 2.0, prior, "friction").bounds
+    assert bounds == pytest.approx((2.0 / factor, 2.0 * factor), rel=1e-9)
 
 
 def test_all_79_parameters_at_their_prior_means_give_the_described_mass():

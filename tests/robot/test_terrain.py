@@ -1,5 +1,7 @@
 """Terrain map: heights of each kind of tile, and their placement, against NumPy and the kernels' surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,13 @@ def test_random_ground_has_amplitude_and_is_reproducible_by_seed(kind):
     assert np.abs(z).max() == pytest.approx(0.6 * 0.05)
     np.testing.assert_array_equal(z, tile(kind, 0.6))
     assert np.abs(z - tile(kind, 0.6, seed=1)).max() > 0.01
+
+
+def test_waves_grow_to_full_height_over_0_3_m_from_the_level_middle():
+    """The same waves have a level middle of 0.5 m and of 0.2 m; their ratio at 1 m is due to the scale of heights."""
+    late, early = (tile("waves", cfg=replace(CFG, cell=0.05, start=start))[40] for start in (0.5, 0.2))
+    at = 40 + np.array([10, 13, 16])  # nodes at x = 0.5, 0.65, 0.8 m
+    assert late[at] / early[at] / (late[60] / early[60]) == pytest.approx([0.0, 0.5, 1.0], abs=1e-9)
 
 
 def test_map_places_tiles_by_row_and_column():

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, POS, QUAT, X, Z
+from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, POS, QUAT, X, Y, Z
 from jump_helpers import DEG, Robots, edit_episodes, make_env, make_episode, only, without_draws
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
@@ -120,9 +120,10 @@ def test_noise_of_goal_and_height_is_independent_and_clamped_at_one_sigma(steps)
 
 def test_height_is_measured_from_the_ground_below_the_base():
     robots = Robots(HORIZONTAL, 2)
-    robots.heights = np.array([[0.0, 0.0, -0.15], [0.0, 0.0, -0.15]])  # falls from x = 0 to x = 2 m
-    robots.q[:, X], robots.q[:, Z] = (-1.0, 1.0), (0.4, 0.3)
-    np.testing.assert_allclose(robots.observe()[:, 2], [0.4, 0.3 + 0.075], atol=1e-6)
+    # falls by 0.15 m from x = 0 to x = 2 m, rises by 0.1 m from y = -2 m to y = 2 m
+    robots.heights = np.array([[0.0, 0.0, -0.15], [0.1, 0.1, -0.05]])
+    robots.q[:, X], robots.q[:, Y], robots.q[:, Z] = (-1.0, 1.0), (1.0, -2.0), (0.4, 0.3)
+    np.testing.assert_allclose(robots.observe()[:, 2], [0.4 - 0.075, 0.3 + 0.075], atol=1e-6)
 
 
 @pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=lambda task: task.name)
