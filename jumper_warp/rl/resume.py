@@ -187,12 +187,15 @@ def saved_seconds(state: Json) -> float:
 
 
 def random_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Return the states of a learner's random generator, `learner`, and of torch's default one, `cpu`."""
-    return {"cpu": torch.get_rng_state(), "learner": generator.get_state()}
+    """Return the states of a learner's random generator, `learner`, and of torch's default ones, `cpu` and `cuda`."""
+    state = {"cpu": torch.get_rng_state(), "learner": generator.get_state()}
+    if torch.cuda.is_available():
+        state["cuda"] = torch.cuda.get_rng_state()
+    return state
 
 
 def set_random_state(state: dict[str, torch.Tensor], generator: torch.Generator) -> None:
-    """Set a learner's random generator, and torch's default one, to states from `random_state`.
+    """Set a learner's random generator, and torch's default ones, to states from `random_state`.
 
     Checkpoints of earlier versions lack `learner`; their learner used torch's default generator of its device. A state
     of another kind of device changes nothing.
@@ -203,6 +206,8 @@ def set_random_state(state: dict[str, torch.Tensor], generator: torch.Generator)
     current = random_state(generator)
     learner = state.get("learner", state.get(generator.device.type))
     parts = {"cpu": (state["cpu"], torch.default_generator)}
+    if "cuda" in current.keys() & state.keys():
+        parts["cuda"] = (state["cuda"], torch.cuda.default_generators[torch.cuda.current_device()])
     if learner is not None and learner.shape == current["learner"].shape:
         parts["learner"] = (learner, generator)
     for name, (part, _) in parts.items():
