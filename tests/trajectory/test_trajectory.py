@@ -11,6 +11,7 @@ from jumper_warp.diff.rollout import Rollout
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
+from jumper_warp.tasks.jump.horizontal import LANDING_HEIGHT
 from jumper_warp.trajectory import jumps
 from jumper_warp.trajectory.augmented_lagrangian import minimise
 from jumper_warp.trajectory.problem import Knots, Problem, SimulatedMotion, Values
@@ -90,6 +91,15 @@ def test_momentum_in_flight_follows_a_parabola(jump):
     assert later.spin.numpy() == pytest.approx(takeoff.spin.numpy(), abs=0.02)  # [kg m^2/s]
 
 
+def test_farthest_is_the_distance_of_a_projectile_to_the_tasks_landing_height(jump):
+    motion = jump.motion
+    start, takeoff = motion.start, motion.momentum_at_takeoff(0.25)
+    landing = LANDING_HEIGHT + float(start.com[0, 2] - motion.q[0, 0, 2])  # of the com
+    (ahead, _, up), (x, _, z) = takeoff.vel[0].tolist(), takeoff.com[0].tolist()
+    time = np.roots([-0.5 * 9.81, up, z - landing]).max()
+    assert -float(jumps.farthest()(motion)) == pytest.approx(x - float(start.com[0, 0]) + ahead * time, abs=1e-6)
+
+
 def test_motion_and_apex_match_simulation(jump):
     jump_problem, x, motion = jump
     settings = {name: getattr(jump_problem, name) for name in ("motors", "command_filter", "friction")}
@@ -126,6 +136,7 @@ def test_highest_ignores_a_second_hop():
     x[:, 2:4], x[:, 4] = 0.5, -0.5  # squat, push-off
     with torch.no_grad():
         motion = jump_problem.motion(x.reshape(1, -1))
+    assert jump_problem.world_steps == 56  # one world
     height, row = motion.q[:, 0, 2].numpy(), int(motion.takeoff(0.25)[0])
     touchdown = row + int(motion.down[row:, :, 0].any(dim=1).int().argmax())
     assert row < 15 and height[touchdown:].max() > height[:touchdown].max() + 0.05  # [m]: the jump is higher
