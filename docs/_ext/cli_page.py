@@ -14,6 +14,7 @@ from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
 from jumper_warp.cli.export import ExportCfg
 from jumper_warp.cli.export_robot import ExportRobotCfg
 from jumper_warp.cli.flags import Flag, list_flags
+from jumper_warp.cli.list import RunsCfg
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
@@ -57,6 +58,7 @@ def cli_page() -> str:
         section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
         section("list", COMMANDS["list"], list_flags(settings_of("list")[0])),
+        section("list runs", doc(RunsCfg), list_flags(RunsCfg)),
         section("info NAME", COMMANDS["info"], list_flags(settings_of("info")[0])),
         section("doctor", COMMANDS["doctor"], list_flags(settings_of("doctor")[0])),
         section("completion SHELL", COMMANDS["completion"], list_flags(CompletionCfg)),

@@ -122,24 +122,24 @@ def describe_run(folder: Path) -> Json:
 
     success: last logged one, mean over seeds; None: not logged. Raises InputError: its configuration is unreadable.
     """
-    from jumper_warp.rl.metrics_file import METRICS_FILE
-    from jumper_warp.rl.run_names import last_metrics, seed_folders, start_time, title
+    from jumper_warp.rl.metrics_file import last_metrics
+    from jumper_warp.rl.run_names import seed_folders, start_time, title
     from jumper_warp.utils.files import read_json
 
     folders = list(seed_folders(folder).values()) or [folder]
     configs = [read_json(each / "config.json", "settings of a run") for each in folders]
-    lines = [last_metrics(each, METRICS_FILE) for each in folders]
+    lines = [last_metrics(each) for each in folders]
     known = [value for line in lines if (value := line.get("Metrics/success")) is not None]
     train = configs[0]["train"]
     return {
         "name": title(folder),
-        "task": train["task"],
+        "task": str(train["task"]),
         "started": start_time(folder),
         "seeds": [config["train"]["seed"] for config in configs],
-        "success": sum(known) / len(known) if known else None,
+        "success": sum(map(float, known)) / len(known) if known else None,
         "iteration": max(int(line.get("iteration") or 0) for line in lines),
-        "commit": (configs[0].get("commit") or {}).get("hash"),
-        "tags": list(train.get("tags", ())),
+        "commit": str((configs[0].get("commit") or {}).get("hash") or ""),
+        "tags": [str(tag) for tag in train.get("tags", ())],
         "folder": str(folder),
     }
 
@@ -148,13 +148,12 @@ def print_runs(cfg: RunsCfg) -> None:
     """Print a table, or JSON data, of the trainings in a log folder; folders without readable settings are left out."""
     from rich.table import Column, Table
 
-    from jumper_warp.utils.errors import InputError
     from jumper_warp.utils.progress import format_duration
     from jumper_warp.utils.tables import print_table
 
     runs = []
     for folder in cfg.log_root.glob("*/*/"):
-        with suppress(InputError, LookupError, TypeError):
+        with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
             runs.append(describe_run(folder))
     runs.sort(key=lambda run: run["started"], reverse=True)
     if cfg.json:
@@ -167,9 +166,11 @@ def print_runs(cfg: RunsCfg) -> None:
         success = "" if run["success"] is None else f"{100.0 * run['success']:.1f} %"
         seeds = ", ".join(map(str, run["seeds"]))
         age = format_duration(time.time() - run["started"])
-        commit = (run["commit"] or "")[:8]
-        table.add_row(run["name"], run["task"], age, seeds, success, commit, ", ".join(run["tags"]))
-    print_table(table)
+        table.add_row(run["name"], run["task"], age, seeds, success, run["commit"][:8], ", ".join(run["tags"]))
+    if runs:
+        print_table(table)
+    else:
+        print(f"jumper: {cfg.log_root}: no trainings", file=sys.stderr)
 
 
 def quantity(metric: Json | None) -> str:

@@ -171,6 +171,8 @@ class Rollout(Uncopied):
         actuation.limits = self.array(np.repeat(filter_constants(command_filter)[:, None], n, axis=1))
         return actuation
 
+    # ------------------------------------------------------------------ the robots' start and geometry
+
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the model's initial standing pose at rest, as coordinates and rates of base and motors.
 
@@ -214,6 +216,8 @@ class Rollout(Uncopied):
         for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
             legs[name] = column
         self.dynamics.robot.geometry.assign(legs)
+
+    # ------------------------------------------------------------------ forward and reverse pass
 
     @locked
     def run(
@@ -366,6 +370,8 @@ class Rollout(Uncopied):
             names[name] = gradient[first : first + count] if array.ndim > 1 else gradient[first]
             first += count
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
+
+    # ------------------------------------------------------------------ arrays and launches
 
     def _timing(self, count: int) -> KernelStruct:
         """Return the struct with a rollout's numbers of policy and physics steps, which the kernels read."""

@@ -178,6 +178,8 @@ class Env(Stages):
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.episodes, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
+    # ------------------------------------------------------------------ episodes and steps
+
     @locked
     def reset(
         self, seed: int | None = None, *, worlds: Values | None = None
@@ -287,6 +289,8 @@ class Env(Stages):
                 "observe": lambda: self._observe(part, after_reset=0),
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
+    # ------------------------------------------------------------------ settings, commands and hand-overs
+
     def set(self, name: str, value: float, skill: int = 0) -> None:
         """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
@@ -365,6 +369,8 @@ class Env(Stages):
     def _array(self, values: np.ndarray) -> wp.array:
         """Copy values to a float array on the environment's device, for a kernel launch."""
         return wp.array(values, dtype=float, device=self.wp_device)
+
+    # ------------------------------------------------------------------ what the environment shows, and saved states
 
     @locked
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:

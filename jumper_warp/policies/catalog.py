@@ -22,7 +22,7 @@ from typing import Any
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.registry import task_name
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.run_names import SEED, newest, seed_of, split_seed
+from jumper_warp.rl.run_names import SEED, newest, seed_folders, split_seed
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.errors import InputError, suggestion
@@ -89,15 +89,18 @@ def newest_run(source: str | Path) -> str | Path:
     """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged.
 
     Of a run of several seeds, return the folder of the seed N that `source` names, as RUN:N, or of the median seed; see
-    `seed_of`. Raises InputError: the run has no such seed.
+    `seed_of`. Raises CheckpointError: the run has no such seed.
     """
     path, seed = split_seed(source)
     if _own_policy(path) or not path.is_dir():
         return source
     if not path.name.startswith(SEED) and not any(path.glob(f"{SEED}*/")):
         path = newest(filter(is_run, path.glob("*/"))) or path
-    found = seed_of(path, seed)
-    return source if found == Path(source) else found
+    if seed is not None or seed_folders(path):
+        from jumper_warp.rl.checkpoint import seed_of  # imports PyTorch
+
+        path = seed_of(path, seed)
+    return source if path == Path(source) else path
 
 
 def _no_policy(text: str, path: Path) -> str:

@@ -241,7 +241,7 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
 def _policy_of_rsl_rl(state: Json) -> Policy:
     """Return the policy in a checkpoint of rsl-rl 5, `saved`, with the `config` (`env`, perhaps `train`) beside it.
 
-    Its normaliser adds RSL_RL_EPS to the standard deviation; without one, observations are left as they are.
+    Its normaliser adds RSL_RL_EPS to the standard deviation; without one, observations stay raw.
     """
     config = state["config"]
     saved = state["saved"]

@@ -6,12 +6,13 @@ import hashlib
 import io
 import json
 import math
+import statistics
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.rl.run_names import MANIFEST
+from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, seed_folders
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, existing_file, read_file, read_json, write_atomically
 
@@ -145,6 +146,23 @@ def best_checkpoint(folder: Path) -> Path:
     Raises CheckpointError: there is none.
     """
     return folder / (_best(_read_manifest(folder)) or newest_name(folder))
+
+
+def seed_of(run: Path, seed: int | None) -> Path:
+    """Return the folder of a seed of a run, by default of the median seed by the score of its best checkpoint.
+
+    Raises CheckpointError: there is no such seed with a checkpoint, or a manifest is unreadable.
+    """
+    folders = {name: path for name, path in seed_folders(run).items() if any((path / CHECKPOINTS).glob("*.pt"))}
+    if seed is None and folders:
+        manifests = {path: _read_manifest(path / CHECKPOINTS) for path in folders.values()}
+        scores = {path: manifest[best]["score"] for path, manifest in manifests.items() if (best := _best(manifest))}
+        middle = statistics.median_low(scores.values()) if scores else None
+        return next((path for path, score in scores.items() if score == middle), next(iter(manifests)))
+    if seed is None or seed not in folders:
+        known = ", ".join(map(str, folders)) or "none"
+        raise CheckpointError(f"{run}: no checkpoint of seed {seed}; seeds with checkpoints: {known}")
+    return folders[seed]
 
 
 def _best(manifest: dict[str, Json]) -> str | None:

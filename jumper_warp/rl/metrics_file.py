@@ -8,7 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from jumper_warp.utils.files import existing_file, write_atomically
+from jumper_warp.utils.files import Json, existing_file, parse_json, read_file, write_atomically
 
 METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object per logged iteration
 
@@ -64,6 +64,14 @@ class MetricsFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def last_metrics(run: Path) -> Json:
+    """Return the last line that a training logged, as a dict; empty: there is none, or it is malformed."""
+    with suppress(ValueError, IndexError, OSError):
+        line = parse_json(read_file(run / METRICS_FILE, "metrics of a run").splitlines()[-1], METRICS_FILE)
+        return line if isinstance(line, dict) else {}
+    return {}
 
 
 def _iteration_of(line: bytes) -> float:

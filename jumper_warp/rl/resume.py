@@ -187,8 +187,11 @@ def saved_seconds(state: Json) -> float:
 
 
 def random_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Return the states of a learner's random generator, `learner`, and of torch's default ones, `cpu` and `cuda`."""
-    state = {"cpu": torch.get_rng_state(), "learner": generator.get_state()}
+    """Return the states of a learner's random generator and of torch's default ones, `cpu` and `cuda`.
+
+    The learner's is `learner_cpu` or `learner_cuda`, by its device.
+    """
+    state = {"cpu": torch.get_rng_state(), f"learner_{generator.device.type}": generator.get_state()}
     if torch.cuda.is_available():
         state["cuda"] = torch.cuda.get_rng_state()
     return state
@@ -197,19 +200,18 @@ def random_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
 def set_random_state(state: dict[str, torch.Tensor], generator: torch.Generator) -> None:
     """Set a learner's random generator, and torch's default ones, to states from `random_state`.
 
-    Checkpoints of earlier versions lack `learner`; their learner used torch's default generator of its device. A state
-    of another kind of device changes nothing.
-    Raises InputError: a part is missing or not a generator's state.
+    Checkpoints of earlier versions lack the learner's, which then was torch's default one of its device. States of
+    another kind of device are not used. Raises InputError: a part is missing or not a generator's state.
     """
+    current = random_state(generator)
     if not isinstance(state, dict) or "cpu" not in state:
         raise InputError("rng lacks cpu")
-    current = random_state(generator)
-    learner = state.get("learner", state.get(generator.device.type))
+    kind = generator.device.type
     parts = {"cpu": (state["cpu"], torch.default_generator)}
     if "cuda" in current.keys() & state.keys():
         parts["cuda"] = (state["cuda"], torch.cuda.default_generators[torch.cuda.current_device()])
-    if learner is not None and learner.shape == current["learner"].shape:
-        parts["learner"] = (learner, generator)
+    if (learner := state.get(f"learner_{kind}", state.get(kind))) is not None:
+        parts[f"learner_{kind}"] = (learner, generator)
     for name, (part, _) in parts.items():
         check_tensor(part, current[name], f"rng.{name}")
     try:

@@ -1,4 +1,4 @@
-"""Folders of training runs: their names, those of their seeds, and what `jumper list runs` shows of them.
+"""Folders of training runs: their names and those of their seeds.
 
 A run's folder is named by the local time of its start, with its offset from UTC, and perhaps by its `run_name`. A run
 of several seeds has a folder `seed_N` for each, which is a run's folder too; `RUN:N` is short for it.
@@ -6,15 +6,10 @@ of several seeds has a folder `seed_N` for each, which is a run's folder too; `R
 
 from __future__ import annotations
 
-import json
-import statistics
 from collections.abc import Iterable
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-
-from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json
 
 LOCAL = "%Y-%m-%d_%H-%M-%S_%f"
 ZONED = 31  # Number of characters of the time in a folder's name
@@ -51,7 +46,10 @@ def title(folder: Path) -> str:
     folder = folder.resolve()
     if folder.name.startswith(SEED):
         return f"{title(folder.parent)}:{folder.name.removeprefix(SEED)}"
-    return folder.name[ZONED + 1 :] or folder.name
+    with suppress(ValueError):
+        datetime.strptime(folder.name[:ZONED], f"{LOCAL}%z")
+        return folder.name[ZONED + 1 :] or folder.name
+    return folder.name
 
 
 def seed_folders(run: Path) -> dict[int, Path]:
@@ -66,34 +64,3 @@ def split_seed(source: str | Path) -> tuple[Path, int | None]:
     if text and seed.isdecimal() and not Path(source).exists():
         return Path(text), int(seed)
     return Path(source), None
-
-
-def seed_of(run: Path, seed: int | None) -> Path:
-    """Return the folder of a seed of a run, by default of the median seed by the score of its best checkpoint.
-
-    A run of one seed has no such folders: without a seed, return the run. Raises InputError: there is no such seed.
-    """
-    folders = {name: path for name, path in seed_folders(run).items() if any((path / CHECKPOINTS).glob("*.pt"))}
-    if seed is None:
-        scores = {path: score for path in folders.values() if (score := best_score(path)) is not None}
-        middle = statistics.median_low(scores.values()) if scores else None
-        return next((path for path, score in scores.items() if score == middle), next(iter(folders.values()), run))
-    if seed not in folders:
-        known = ", ".join(map(str, folders)) or "none"
-        raise InputError(f"{run}: no checkpoint of seed {seed}; seeds with checkpoints: {known}")
-    return folders[seed]
-
-
-def best_score(run: Path) -> float | None:
-    """Return the score of the best checkpoint in a run's folder; None: none has a score."""
-    entries = read_json(run / CHECKPOINTS / MANIFEST, "checksums of checkpoints", finite=False).values()
-    scores = [entry["score"] for entry in entries if entry.get("score") is not None]
-    return max(scores, default=None)
-
-
-def last_metrics(run: Path, file: str) -> dict[str, float | None]:
-    """Return the metrics of the last line that a training logged in `file`; empty: there is none."""
-    with suppress(OSError, ValueError, IndexError):
-        line = json.loads((run / file).read_bytes().splitlines()[-1])
-        return line if isinstance(line, dict) else {}
-    return {}

@@ -42,8 +42,8 @@ def train(
     if weights are not finite.
     """
     with ExitStack() as cleanup:
-        rank = prepare(cfg, actor_init, checkpoint, cleanup)
-        checkpoint = checkpoint or next(iter(resume.find_checkpoints(cfg)), None)
+        rank, checkpoints = prepare(cfg, actor_init, [checkpoint] if checkpoint else [], cleanup)
+        checkpoint = checkpoints[0] if checkpoints else None
         if checkpoint is not None and rank.index == 0:
             lock(checkpoint, cleanup)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
@@ -63,18 +63,22 @@ def train(
         return finish(run.result(), [run], stop)
 
 
-def prepare(cfg: TrainCfg, actor_init: ActorInit | None, resumed: object, cleanup: ExitStack) -> Rank:
-    """Set threads and device of this process, join its process group until `cleanup` ends, and return the rank.
+def prepare(
+    cfg: TrainCfg, actor_init: ActorInit | None, checkpoints: Sequence[Checkpoint], cleanup: ExitStack
+) -> tuple[Rank, Sequence[Checkpoint]]:
+    """Set threads and device of this process, join its process group until `cleanup` ends, and find the checkpoints.
 
-    Raises InputError: the settings do not fit; init_policy and actor_init are not passed together.
+    Returned: the rank, and `checkpoints`, by default those that cfg.resume selects. Raises InputError: the settings do
+    not fit, or init_policy and actor_init are not passed together. CheckpointError as `resume.find_checkpoints`.
     """
     set_threads(cfg.threads)
     rank = distributed.init_distributed(cfg.device, cfg.threads)
     cleanup.callback(leave_process_group)
     cfg.check_processes(rank.size)
-    if not resumed and not cfg.resume and bool(cfg.init_policy) != (actor_init is not None):
+    checkpoints = checkpoints or resume.find_checkpoints(cfg)
+    if not checkpoints and bool(cfg.init_policy) != (actor_init is not None):
         raise InputError("init_policy and actor_init, which is made from it, must be passed together")
-    return rank
+    return rank, checkpoints
 
 
 def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda: None) -> StopRequest:
@@ -106,8 +110,8 @@ def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda:
 
 
 def finish(result: TrainResult, runs: Sequence[TrainingRun], stop: StopRequest) -> TrainResult:
-    """Return the result of trainings that ended. Raises SystemExit: all failed, or a signal stopped them."""
-    if all(run.failure for run in runs):
+    """Return the result of trainings that ended. Raises SystemExit: all of `runs` failed, or a signal stopped them."""
+    if runs and all(run.failure for run in runs):
         raise SystemExit(f"jumper: {runs[0].failure}")  # printed by Python, which exits with status 1
     if stop.requested:
         raise SystemExit(INTERRUPTED)

@@ -41,11 +41,11 @@ def train(
     Under torchrun every process trains a part of the seeds, without the others. A seed whose training fails, since its
     weights are not finite, or a term with `stop_on_nan`, is frozen: the others continue, and a resume omits it.
     checkpoints: one of each seed to continue from (default: those that cfg.resume selects). Other arguments and errors:
-    see `jumper_warp.rl.runner.train`; a failure raises SystemExit if all seeds failed.
+    see `jumper_warp.rl.runner.train`; a failure raises SystemExit if all seeds failed, except under torchrun.
     """
     with ExitStack() as cleanup:
-        rank = prepare(cfg, actor_init, checkpoints, cleanup)
-        resumed = _by_seed(cfg, checkpoints or resume.find_checkpoints(cfg))
+        rank, checkpoints = prepare(cfg, actor_init, checkpoints, cleanup)
+        resumed = _by_seed(cfg, checkpoints)
         first = next(iter(resumed.values()), None)
         folder = new_folder(cfg, rank) if first is None else first.path.parents[2]
         leave_process_group()
@@ -76,7 +76,8 @@ def train(
         lines = [f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}", *table(results, cfg.best_metric)]
         for line in lines:
             console.print_line(line)
-        return finish(_total(folder, results), runs, stop)
+        failing = runs if rank.size == 1 else []  # an exit status of 1 would end the processes of the other seeds
+        return finish(_total(folder, results), failing, stop)
 
 
 def _by_seed(cfg: TrainCfg, checkpoints: Sequence[Checkpoint]) -> dict[int, Checkpoint]:

@@ -59,3 +59,12 @@ def test_resume_continues_the_seeds(folder, logs, capsys):
     assert (code, out.strip()) == (0, str(folder))
     assert any(line.startswith("seed 5: resumed") for line in err)
     assert {path.name for path in folder.glob("seed_*/checkpoints/*2.pt")} == {"iteration_000002.pt"}
+
+
+@pytest.mark.parametrize("content", ["[]", "{", '{"train": {"task": 3, "seed": 1, "tags": 5}}'])
+def test_list_runs_leaves_out_folders_with_damaged_settings(content, capsys, tmp_path):
+    damaged = tmp_path / "push" / "one"
+    damaged.mkdir(parents=True)
+    (damaged / "config.json").write_text(content)
+    code, out, err = run(capsys, "list", "runs", "--log-root", str(tmp_path))
+    assert (code, out, err) == (0, "", [f"jumper: {tmp_path}: no trainings"])

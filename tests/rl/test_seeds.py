@@ -14,7 +14,7 @@ from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import FROZEN, find_checkpoints
 from jumper_warp.rl.run_folder import CONFIG
-from jumper_warp.rl.run_names import best_score, run_name, seed_folders, title
+from jumper_warp.rl.run_names import run_name, seed_folders, title
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, equal, free_port, push_cfg, train_seeds_rank
@@ -63,7 +63,7 @@ def test_resume_continues_all_seeds_bitwise(cfg):
     for seed, folder in seed_folders(whole.folder).items():
         ours, theirs = state(folder), state(again.folder / f"seed_{seed}")
         assert equal(ours["ppo"], theirs["ppo"]) and equal(ours["env"], theirs["env"])
-        assert torch.equal(ours["rng"]["learner"], theirs["rng"]["learner"])
+        assert torch.equal(ours["rng"]["learner_cpu"], theirs["rng"]["learner_cpu"])
 
 
 def test_two_processes_share_the_seeds_without_changing_their_results(cfg, tmp_path):
@@ -94,16 +94,13 @@ def test_resume_takes_the_last_iteration_that_all_seeds_have(cfg):
 
 def spoil(monkeypatch, spoiled, at):
     """Set the weights of some learners, counted by their making, to NaN in their update number `at`."""
-    learners = []
+    updates = {}  # number of updates of each learner
     update = Learner.update
 
     def spoiling(self):
         update(self)
-        if self not in [each for each, _ in learners]:
-            learners.append((self, []))
-        counts = dict((id(each), count) for each, count in learners)[id(self)]
-        counts.append(0)
-        if [id(each) for each, _ in learners].index(id(self)) in spoiled and len(counts) == at:
+        updates[self] = updates.get(self, 0) + 1
+        if list(updates).index(self) in spoiled and updates[self] == at:
             self.flat.value.fill_(float("nan"))
 
     monkeypatch.setattr(Learner, "update", spoiling)
@@ -145,10 +142,24 @@ def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
         path = folder / CHECKPOINTS / MANIFEST
         manifest = json.loads(path.read_text())
         path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
-    assert [best_score(folder) for folder in folders.values()] == scores
     assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[7]
     with pytest.raises(InputError, match="no checkpoint of seed 3; seeds with checkpoints: 1, 4, 7"):
         newest_run(f"{result.folder}:3")
+
+
+@pytest.mark.parametrize("content", ["[]", "{", '{"a.pt": 3}'])
+def test_a_damaged_manifest_of_a_seed_is_named(cfg, content):
+    folder = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder
+    (folder / "seed_4" / CHECKPOINTS / MANIFEST).write_text(content)
+    with pytest.raises(CheckpointError, match=r"seed_4.checkpoints.manifest.json"):
+        newest_run(folder)
+
+
+def test_a_new_run_needs_the_initial_actor_that_its_settings_name(cfg):
+    new = dataclasses.replace(cfg, init_policy="vertical_jump", resume="latest-or-new")
+    for function, settings in ((seeds.train, new), (train, dataclasses.replace(new, seeds=()))):
+        with pytest.raises(InputError, match="init_policy and actor_init"):
+            function(settings, SeededTask)
 
 
 def test_progress_shows_mean_and_interval_over_seeds(cfg, capsys):
@@ -166,6 +177,8 @@ def test_name_of_a_run_is_in_its_folder_and_its_title(cfg):
     assert result.folder.name.endswith("_first-try")
     assert title(result.folder) == "first-try" and title(result.folder / "seed_4") == "first-try:4"
     assert title(result.folder.with_name(run_name(0))) == run_name(0)
+    renamed = "the_training_with_much_lower_gains_of_the_motors"
+    assert title(result.folder.with_name(renamed)) == renamed
     settings = json.loads((result.folder / "seed_4" / CONFIG).read_text())["train"]
     assert (settings["seed"], settings["seeds"], settings["run_name"]) == (4, [], "first try")
 
