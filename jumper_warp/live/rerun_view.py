@@ -1,0 +1,235 @@
+"""Live view of watched worlds in the Rerun viewer: scene, reward terms as stacked bars, and learning curves.
+
+Entities; times are training times [s], so that robots and curves share the timeline:
+    scene/ground, scene/<link>    meshes; one instance of a link for each robot
+    scene/names, scene/goals      labels above the robots, and rings at their goals
+    rewards                       sums of the reward terms over the episode, one stacked bar for each robot
+    curves/<group>/<name>         metrics of the training, from its metrics file
+    status                        text
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from socket import create_connection, socket
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from jumper_warp.live.scene import RobotScene
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.style import BASE_COLOR, GOAL_COLOR, LEG_COLORS
+
+LOOPBACK = "127.0.0.1"
+SERVER_MEMORY = "500MB"  # of the server, which buffers data for viewers that join later; it drops the oldest
+VIEWER_MEMORY = "1GB"  # of a viewer, which drops the oldest data too
+ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
+TIMELINE = "time"
+RING = 0.1 * np.stack([np.cos(a := np.linspace(0.0, 2.0 * np.pi, 25)), np.sin(a), 0.0 * a], axis=1)  # [m]
+ABOVE = np.array([0.0, 0.0, 0.3])  # [m] from a robot's base to its name
+PALETTE = np.array(
+    [*LEG_COLORS.values(), (0.34, 0.71, 0.91), (0.84, 0.37, 0.0), (0.94, 0.89, 0.26), (0.5, 0.5, 0.5), BASE_COLOR]
+)
+EYE = np.array([3.2, -1.0, 1.9])  # [m] camera, from the middle of the robots
+GROUPS = {
+    "Train/mean_reward": "reward", "Metrics/": "metrics", "Episode_Termination/": "terminations",
+    "Episode_Reward/": "reward terms", "Episode_Sum/": "reward terms", "Curriculum/": "curriculum",
+    "Loss/": "losses", "Perf/total_fps": "speed",
+}  # fmt: skip
+"""Group of curves by the beginning of the metric's name; other metrics are not shown."""
+
+
+class RerunServer:
+    """Server on this machine's loopback address that keeps the newest data for viewers that join later.
+
+    url: for the Rerun viewer; page: the same in a browser.
+    """
+
+    def __init__(self) -> None:
+        """Start the server and wait until it listens. Raises OSError: it has ended."""
+        port, page = (free_port() for _ in range(2))
+        command = [sys.executable, "-P", "-m", "rerun", "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
+        command += ["--web-viewer-port", str(page), "--server-memory-limit", SERVER_MEMORY]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        self.page = f"http://{LOOPBACK}:{page}/?url={quote(self.url, safe='')}"
+        while not is_served(self.url):
+            if self._process.poll() is not None:
+                raise OSError(f"the Rerun server ended with status {self._process.returncode}")
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """End the server."""
+        self._process.terminate()
+        self._process.wait()
+
+
+def free_port() -> int:
+    """Return a TCP port of the loopback address that no process uses."""
+    with socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
+
+
+def is_served(url: str) -> bool:
+    """Return whether a server listens at the address of `RerunServer.url`."""
+    host, _, port = url.removeprefix("rerun+http://").removesuffix("/proxy").partition(":")
+    try:
+        create_connection((host, int(port)), 1.0).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def has_display() -> bool:
+    """Return whether windows can be opened: on Linux a display is set."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_window(url: str) -> None:
+    """Open a window of the Rerun viewer, which lives on after this process."""
+    command = [sys.executable, "-P", "-m", "rerun", url, "--bind", LOOPBACK, "--memory-limit", VIEWER_MEMORY]
+    options: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.Popen(command, start_new_session=True, **options)
+
+
+def announce(url: str, page: str) -> None:
+    """Open a window if there is a display, and print the addresses of the live view."""
+    if has_display():
+        open_window(url)
+    ports = " ".join(f"-L {part}:{LOOPBACK}:{part}" for part in (port_of(page), port_of(url)))
+    print(f"watch: {page} in a browser; on another computer after ssh {ports} HOST", file=sys.stderr, flush=True)
+
+
+def port_of(address: str) -> str:
+    """Return the port in a URL of the loopback address."""
+    return address.split(f"{LOOPBACK}:")[1].partition("/")[0]
+
+
+class RerunView:
+    """View of the robots of several slots in a Rerun stream."""
+
+    def __init__(self, stream: Any, scene: RobotScene, names: Sequence[str], terms: Sequence[str]) -> None:
+        """Log everything that does not change; stream: a `RecordingStream`; names: of the slots; terms: of rewards."""
+        self._stream = stream
+        self._names = list(names)
+        self._terms = list(terms)
+        self._links = [f"scene/{link}" for link in scene.links]
+        self._largest = 1.0e-6  # Largest height of a bar so far
+        stream.send_blueprint(blueprint(), make_active=True, make_default=True)
+        stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for body, entity in enumerate(["scene/ground", *self._links], start=-1):
+            stream.log(entity, _mesh([shape for shape in scene.shapes if shape.body == body]), static=True)
+        colors = PALETTE[np.arange(len(terms)) % len(PALETTE)]
+        places = [[len(names) + 0.2, 1.0 - 2.0 * i / max(len(terms) - 1, 1)] for i in range(len(terms))]
+        legend = rr.Points2D(_upright(places), labels=self._terms, colors=_rgb(colors), radii=0.03, show_labels=True)
+        stream.log("rewards/legend", legend, static=True)
+        self._colors = _rgb(np.tile(colors, (len(names), 1)))
+
+    def show(self, times: np.ndarray, poses: np.ndarray, goals: np.ndarray) -> None:
+        """Show the robots; times [s]: (frames,); poses: (frames, slots, links, 7) as drawn; goals [m]: (slots, 3)."""
+        column = [rr.TimeColumn(TIMELINE, duration=times)]
+        lengths = [poses.shape[1]] * len(times)
+        for link, entity in enumerate(self._links):
+            flat = poses[:, :, link].reshape(-1, 7)
+            instances = rr.InstancePoses3D.columns(translations=flat[:, :3], quaternions=flat[:, 3:])
+            self._stream.send_columns(entity, column, instances.partition(lengths))
+        self._stream.set_time(TIMELINE, duration=times[-1])
+        self._stream.log("scene/names", rr.Points3D(poses[-1, :, 0, :3] + ABOVE, labels=self._names, radii=0.0))
+        rings = [goal + RING for goal in goals if np.isfinite(goal).all()]
+        self._stream.log("scene/goals", rr.LineStrips3D(rings, colors=_rgb([GOAL_COLOR]), radii=0.01))
+
+    def show_rewards(self, when: float, sums: np.ndarray) -> None:
+        """Show stacked bars of the terms' sums over the episodes, (slots, terms), at a time [s].
+
+        Positive terms are stacked upward, negative ones downward. The largest bar so far has a height of 1.
+        """
+        tops = np.where(sums > 0.0, np.cumsum(np.maximum(sums, 0.0), axis=1), np.cumsum(np.minimum(sums, 0.0), axis=1))
+        self._largest = max(self._largest, float(np.abs(tops).max()))
+        centers = (tops - 0.5 * sums) / self._largest
+        columns = np.broadcast_to(np.arange(len(sums))[:, None], centers.shape)
+        half = np.abs(0.5 * sums) / self._largest
+        self._stream.set_time(TIMELINE, duration=when)
+        boxes = rr.Boxes2D(
+            centers=_upright(np.stack([columns, centers], axis=-1).reshape(-1, 2)),
+            half_sizes=np.stack([np.full_like(half, 0.35), half], axis=-1).reshape(-1, 2), colors=self._colors,
+        )  # fmt: skip
+        self._stream.log("rewards/terms", boxes)
+        labels = [f"{name} {total:.3g}" for name, total in zip(self._names, sums.sum(axis=1), strict=True)]
+        places = _upright([[i, -1.1] for i in range(len(sums))])
+        self._stream.log("rewards/names", rr.Points2D(places, labels=labels, radii=0.0, show_labels=True))
+
+    def show_curves(self, lines: Sequence[dict[str, Any]], label: str = "") -> None:
+        """Append lines of a metrics file to the curves; label: of the seed, empty for a single one."""
+        curves: dict[str, list[tuple[float, float]]] = {}
+        for line in lines:
+            when = line.get("Perf/elapsed_s") or 0.0
+            for name, value in line.items():
+                group = next((group for start, group in GROUPS.items() if name.startswith(start)), None)
+                if group is not None and value is not None:
+                    entity = f"curves/{group}/{name.split('/')[-1]}{label}"
+                    curves.setdefault(entity, []).append((when, value))
+        for entity, points in curves.items():
+            when, values = np.array(points).T
+            column = [rr.TimeColumn(TIMELINE, duration=when)]
+            self._stream.send_columns(entity.split("/"), column, rr.Scalars.columns(scalars=values))
+
+    def show_status(self, text: str) -> None:
+        """Show a text in Markdown."""
+        self._stream.log("status", rr.TextDocument(text, media_type="text/markdown"))
+
+
+def blueprint() -> rrb.Blueprint:
+    """Return the layout: robots above stacked rewards on the left, curves on the right; the view follows new data."""
+    eye = rrb.EyeControls3D(position=EYE, look_target=[0.0, 0.0, 0.3], eye_up=[0.0, 0.0, 1.0])
+    left = rrb.Vertical(
+        rrb.Spatial3DView(origin="/scene", name="robots", eye_controls=eye, line_grid=False),
+        rrb.Spatial2DView(origin="/rewards", name="reward terms, sums over the episode"),
+        row_shares=[3, 2],
+    )
+    curves = {
+        group: rrb.TimeSeriesView(origin=f"/curves/{group}", name=group) for group in dict.fromkeys(GROUPS.values())
+    }
+    first = [curves.pop(group) for group in ("reward", "metrics", "terminations", "curriculum")]
+    status = rrb.TextDocumentView(origin="/status", name="status")
+    right = rrb.Vertical(*first, rrb.Tabs(status, *curves.values()), row_shares=[1, 1, 1, 1, 1])
+    panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following")
+    layout = rrb.Horizontal(left, right, column_shares=[3, 2])
+    return rrb.Blueprint(layout, panel, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+
+
+def write_address(folders: Sequence[Path], url: str, page: str) -> None:
+    """Write the addresses of a live view to the runs' folders, where `jumper watch` finds them."""
+    for folder in folders:
+        write_atomically(folder / ADDRESS, f"{url}\n{page}\n".encode())
+
+
+def _mesh(shapes: Sequence[ShapeMesh]) -> rr.Mesh3D:
+    """Return shapes in one frame as one mesh, so that a link is one entity."""
+    firsts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
+    triangles = [shape.triangles + first for shape, first in zip(shapes, firsts, strict=False)]
+    colors = [np.tile(_rgb(shape.color), (len(shape.vertices), 1)) for shape in shapes]
+    return rr.Mesh3D(
+        vertex_positions=np.concatenate([shape.vertices for shape in shapes]),
+        vertex_normals=np.concatenate([shape.normals for shape in shapes]),
+        triangle_indices=np.concatenate(triangles), vertex_colors=np.concatenate(colors),
+    )  # fmt: skip
+
+
+def _upright(points: Any) -> np.ndarray:
+    """Return points (n, 2) with y upward as Rerun's, whose y is downward."""
+    return np.asarray(points, dtype=np.float32).reshape(-1, 2) * (1.0, -1.0)
+
+
+def _rgb(colors: Any) -> np.ndarray:
+    """Convert colors (n, 3) in [0, 1] to bytes."""
+    return np.round(255.0 * np.asarray(colors)).astype(np.uint8)
