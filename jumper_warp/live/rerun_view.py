@@ -33,6 +33,13 @@ LOOPBACK = "127.0.0.1"
 SERVER_MEMORY = "500MB"  # of the server, which buffers data for viewers that join later; it drops the oldest
 VIEWER_MEMORY = "1GB"  # of a viewer, which drops the oldest data too
 ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
+SERVER_START = 30.0  # [s] Longest time until the server answers
+KEEPER = """
+import os, signal, subprocess, sys
+server = subprocess.Popen([sys.executable, "-P", "-m", "rerun", *sys.argv[1:]], start_new_session=True)
+sys.stdin.read()
+os.killpg(server.pid, signal.SIGTERM)
+"""  # Program that ends the server with the process that started it, even if this one is killed
 TIMELINE = "time"
 RING = 0.1 * np.stack([np.cos(a := np.linspace(0.0, 2.0 * np.pi, 25)), np.sin(a), 0.0 * a], axis=1)  # [m]
 ABOVE = np.array([0.0, 0.0, 0.3])  # [m] from a robot's base to its name
@@ -55,21 +62,24 @@ class RerunServer:
     """
 
     def __init__(self) -> None:
-        """Start the server and wait until it listens. Raises OSError: it has ended."""
+        """Start the server and wait until it listens. Raises OSError: it does not."""
         port, page = (free_port() for _ in range(2))
-        command = [sys.executable, "-P", "-m", "rerun", "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
+        command = [sys.executable, "-P", "-c", KEEPER, "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
         command += ["--web-viewer-port", str(page), "--server-memory-limit", SERVER_MEMORY]
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, **quiet)
         self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
         self.page = f"http://{LOOPBACK}:{page}/?url={quote(self.url, safe='')}"
+        begin = time.monotonic()
         while not is_served(self.url):
-            if self._process.poll() is not None:
-                raise OSError(f"the Rerun server ended with status {self._process.returncode}")
+            if time.monotonic() > begin + SERVER_START:
+                raise OSError(f"the Rerun server does not answer at {self.url}")
             time.sleep(0.05)
 
     def close(self) -> None:
         """End the server."""
-        self._process.terminate()
+        assert self._process.stdin is not None
+        self._process.stdin.close()
         self._process.wait()
 
 
@@ -100,6 +110,16 @@ def open_window(url: str) -> None:
     command = [sys.executable, "-P", "-m", "rerun", url, "--bind", LOOPBACK, "--memory-limit", VIEWER_MEMORY]
     options: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     subprocess.Popen(command, start_new_session=True, **options)
+
+
+def live_address(run: Path) -> tuple[str, str] | None:
+    """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
+    files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
+    for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
+        url, page = file.read_text().splitlines()
+        if is_served(url):
+            return url, page
+    return None
 
 
 def announce(url: str, page: str) -> None:
@@ -181,7 +201,7 @@ class RerunView:
         for entity, points in curves.items():
             when, values = np.array(points).T
             column = [rr.TimeColumn(TIMELINE, duration=when)]
-            self._stream.send_columns(entity.split("/"), column, rr.Scalars.columns(scalars=values))
+            self._stream.send_columns(rr.new_entity_path(entity.split("/")), column, rr.Scalars.columns(scalars=values))
 
     def show_status(self, text: str) -> None:
         """Show a text in Markdown."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jumper_warp.utils.rotations import CONJUGATE, multiply, rotate
 
@@ -73,9 +72,7 @@ def robot_scene(model: Model) -> RobotScene:
     from jumper_warp.robot.model import build_model
     from jumper_warp.viz.shapes import shape_meshes
 
-    start: NDArray[np.int32] = model.joint_qd_start.numpy()[
-        1:21
-    ]  # joint 0 is the base's; the ankles, which close loops, are the last
+    start = np.asarray(model.joint_qd_start.numpy()[1:21], dtype=int)  # joint 0 is the base's, the ankles are the last
     anchors = model.joint_X_p.numpy()[:, :3]
     return RobotScene(
         tuple(shape_meshes(build_model(1, device="cpu", mujoco=False), (0,))),

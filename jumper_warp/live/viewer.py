@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from jumper_warp.live.rerun_view import RerunView
 
 RATE = 8.0  # [1/s] Updates of the robots; each brings all policy steps since the last one
+SKIPPED = 2  # Policy steps from one shown pose to the next
 SPACING = 1.4  # [m] Distance between robots
 REACH = 1.2  # [m] Horizontal distance from its place at which a robot is held, so that it stays in view
 CURVES_EVERY = 8  # Updates between two reads of the metrics files
@@ -93,7 +94,8 @@ class Show:
         rows = [row for player in players if (row := player.take(count)) is not None]
         if len(rows) == len(players):
             times = setup.elapsed + setup.step_dt * np.arange(self._frames - count + 1, self._frames + 1)
-            view.show(times, *self._drawn(np.stack(rows, axis=1), players))
+            shown = slice((count - 1) % SKIPPED, None, SKIPPED)
+            view.show(times[shown], *self._drawn(np.stack(rows, axis=1)[shown], players))
             if self._updates % 2 == 0:
                 view.show_rewards(times[-1], np.stack([player.terms for player in players]))
         if self._updates % CURVES_EVERY == 0:
@@ -148,7 +150,7 @@ def main() -> None:
     """Show what the standard input brings, until it ends."""
     source = sys.stdin.buffer
     setup: Setup = pickle.load(source)
-    server = view = None
+    server = stream = view = None
     if setup.viewer == "rerun":
         import rerun as rr
 
@@ -177,7 +179,8 @@ def main() -> None:
         show.update()
         time.sleep(max(0.0, started + 1.0 / RATE - time.monotonic()))
     show.end()
-    if server is not None:
+    if server is not None and stream is not None:
+        stream.disconnect()
         server.close()
 
 

@@ -125,11 +125,13 @@ def test_player_shows_whole_episodes_and_repeats_the_last():
     assert shown(player, 1) == [6]
     assert player.terms == [15.0]  # 4 + 5 + 6: the first step has the reward of the episode before
     assert shown(player, 3) == [12, 12, 12]  # the newest
+
+
+def test_player_ignores_the_rest_of_an_episode_that_began_before_its_world_was_watched():
     player = Player(LAYOUT)
-    player.add(rows(0, [1, 0, 1], [1, 2, 3]))
-    assert shown(player, 2) == [1, 2]
-    player.add(rows(1, [0], [9]))  # another world: its episode began before
-    assert shown(player, 3) == [3, 3, 3] or True
+    player.add(rows(0, [1, 0], [1, 2]))
+    player.add(rows(1, [0, 0], [8, 9]))
+    assert shown(player, 4) == [1, 2, 1, 2]
 
 
 def test_player_drops_an_episode_with_lost_steps():
