@@ -70,7 +70,8 @@ def cli_page() -> str:
 def summary() -> str:
     """Return the Markdown table of all commands and their purposes."""
     anchors = {
-        "train": "train-task", "watch": "watch-run", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
+        "train": "train-task", "watch": "watch-run", "finetune": "finetune-policy", "play": "play-policy",
+        "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
     }  # fmt: skip
     rows = [

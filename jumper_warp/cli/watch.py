@@ -34,7 +34,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     cfg = parse(WatchArgs, "watch RUN", args[named:])
     if not named:
         raise UsageError("the run comes first: jumper watch RUN [flags]")
-    from jumper_warp.live.rerun_view import announce, live_address
+    from jumper_warp.live.rerun_view import live_address
+    from jumper_warp.viz.rerun_server import announce
 
     if address := live_address(Path(args[0])):
         announce(*address)

@@ -27,8 +27,8 @@ STEPS = 6  # Policy steps between two messages to the viewer
 def watch_checkpoints(run: Path, device: str, modules: Iterable[ModuleType] = (), seconds: float | None = None) -> None:
     """Simulate the newest checkpoint of a run's folder in real time in a viewer, without exploration noise.
 
-    Worlds have curriculum levels of the checkpoint's worlds. modules: the user's task modules. seconds: time after which
-    to end (default: with the viewer's process).
+    Worlds have curriculum levels of the checkpoint's worlds. modules: the user's task modules. seconds: time after
+    which to end (default: with the viewer's process).
     Raises CheckpointError or TaskError: the run has no usable checkpoint.
     """
     path, state, _, _ = latest_checkpoint(run / CHECKPOINTS)

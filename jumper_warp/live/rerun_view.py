@@ -10,15 +10,9 @@ Entities; times are training times [s], so that robots and curves share the time
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from socket import create_connection, socket
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import rerun as rr
@@ -26,20 +20,11 @@ import rerun.blueprint as rrb
 
 from jumper_warp.live.scene import RobotScene
 from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.rerun_server import is_served
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, GOAL_COLOR, LEG_COLORS
 
-LOOPBACK = "127.0.0.1"
-SERVER_MEMORY = "500MB"  # of the server, which buffers data for viewers that join later; it drops the oldest
-VIEWER_MEMORY = "1GB"  # of a viewer, which drops the oldest data too
 ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
-SERVER_START = 30.0  # [s] Longest time until the server answers
-KEEPER = """
-import os, signal, subprocess, sys
-server = subprocess.Popen([sys.executable, "-P", "-m", "rerun", *sys.argv[1:]], start_new_session=True)
-sys.stdin.read()
-os.killpg(server.pid, signal.SIGTERM)
-"""  # Program that ends the server with the process that started it, even if this one is killed
 TIMELINE = "time"
 RING = 0.1 * np.stack([np.cos(a := np.linspace(0.0, 2.0 * np.pi, 25)), np.sin(a), 0.0 * a], axis=1)  # [m]
 ABOVE = np.array([0.0, 0.0, 0.3])  # [m] from a robot's base to its name
@@ -55,63 +40,6 @@ GROUPS = {
 """Group of curves by the beginning of the metric's name; other metrics are not shown."""
 
 
-class RerunServer:
-    """Server on this machine's loopback address that keeps the newest data for viewers that join later.
-
-    url: for the Rerun viewer; page: the same in a browser.
-    """
-
-    def __init__(self) -> None:
-        """Start the server and wait until it listens. Raises OSError: it does not."""
-        port, page = (free_port() for _ in range(2))
-        command = [sys.executable, "-P", "-c", KEEPER, "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
-        command += ["--web-viewer-port", str(page), "--server-memory-limit", SERVER_MEMORY]
-        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, **quiet)
-        self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
-        self.page = f"http://{LOOPBACK}:{page}/?url={quote(self.url, safe='')}"
-        begin = time.monotonic()
-        while not is_served(self.url):
-            if time.monotonic() > begin + SERVER_START:
-                raise OSError(f"the Rerun server does not answer at {self.url}")
-            time.sleep(0.05)
-
-    def close(self) -> None:
-        """End the server."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
-
-
-def free_port() -> int:
-    """Return a TCP port of the loopback address that no process uses."""
-    with socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return probe.getsockname()[1]
-
-
-def is_served(url: str) -> bool:
-    """Return whether a server listens at the address of `RerunServer.url`."""
-    host, _, port = url.removeprefix("rerun+http://").removesuffix("/proxy").partition(":")
-    try:
-        create_connection((host, int(port)), 1.0).close()
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-def has_display() -> bool:
-    """Return whether windows can be opened: on Linux a display is set."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def open_window(url: str) -> None:
-    """Open a window of the Rerun viewer, which lives on after this process."""
-    command = [sys.executable, "-P", "-m", "rerun", url, "--bind", LOOPBACK, "--memory-limit", VIEWER_MEMORY]
-    options: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    subprocess.Popen(command, start_new_session=True, **options)
-
-
 def live_address(run: Path) -> tuple[str, str] | None:
     """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
     files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
@@ -120,19 +48,6 @@ def live_address(run: Path) -> tuple[str, str] | None:
         if is_served(url):
             return url, page
     return None
-
-
-def announce(url: str, page: str) -> None:
-    """Open a window if there is a display, and print the addresses of the live view."""
-    if has_display():
-        open_window(url)
-    ports = " ".join(f"-L {part}:{LOOPBACK}:{part}" for part in (port_of(page), port_of(url)))
-    print(f"watch: {page} in a browser; on another computer after ssh {ports} HOST", file=sys.stderr, flush=True)
-
-
-def port_of(address: str) -> str:
-    """Return the port in a URL of the loopback address."""
-    return address.split(f"{LOOPBACK}:")[1].partition("/")[0]
 
 
 class RerunView:

@@ -154,7 +154,8 @@ def main() -> None:
     if setup.viewer == "rerun":
         import rerun as rr
 
-        from jumper_warp.live.rerun_view import RerunServer, RerunView, announce, write_address
+        from jumper_warp.live.rerun_view import RerunView, write_address
+        from jumper_warp.viz.rerun_server import RerunServer, announce
 
         server = RerunServer()
         stream = rr.RecordingStream("jumper-warp watch")
