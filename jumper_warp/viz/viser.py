@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
+import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.props import RING_HEIGHT, RING_RADIUS, RING_WIDTH
 from jumper_warp.viz.shapes import CHECKER_CELL, ShapeMesh
 from jumper_warp.viz.style import GOAL_COLOR
 
 if TYPE_CHECKING:
-    from viser import SceneApi
+    from viser import SceneApi, ViserServer
+
+HOST = "127.0.0.1"
+ORIGIN = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
+"""Pattern of the origins whose pages may connect: a page of another site that the user visits may not."""
 
 ROOT = "/world"  # Node whose frame is the world frame, moved so that a followed point is at the viewer's origin
 GROUND = f"{ROOT}/ground"
 GROUND_PERIOD = 2.0 * CHECKER_CELL  # [m] Distance by which the drawn part of a plane moves with the followed point
 FOG = (6.0, 14.0)  # [m] Distance from the camera at which white fog begins, and from which it hides everything
+EYE = (1.3, -1.6, 0.9)  # [m] Initial position of the camera, from the followed point
 GAMMA = 2.2  # Exponent from an sRGB color to the linear one that glTF stores
 
 
@@ -70,10 +80,15 @@ class ViserScene:
         for mark in self.marks:
             mark.remove()
         ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, RING_HEIGHT, sections=48)
-        color = tuple(round(255 * part) for part in GOAL_COLOR)
+        lift = np.array([0.0, 0.0, RING_HEIGHT])
+        red, green, blue = (round(255 * part) for part in GOAL_COLOR)
         self.marks = [
             self.scene.add_mesh_simple(
-                f"{ROOT}/goal_{i}", ring.vertices, ring.faces, color=color, position=goal + [0.0, 0.0, RING_HEIGHT]
+                f"{ROOT}/goal_{i}",
+                ring.vertices,
+                ring.faces,
+                color=(red, green, blue),
+                position=goal + [0.0, 0.0, RING_HEIGHT],
             )
             for i, goal in enumerate(goals)
         ]
@@ -81,6 +96,33 @@ class ViserScene:
     def world_ray(self, origin: Sequence[float], direction: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Convert a ray of a click in the viewer to the world frame; return its origin [m] and direction, (3,) each."""
         return np.asarray(origin, dtype=float) + self.center, np.asarray(direction, dtype=float)
+
+
+def open_server(port: int) -> ViserServer:
+    """Start a viser server on the loopback address and return it; port: the next free one is used if it is taken.
+
+    Pages of other origins and requests for a public tunnel are refused, which viser itself accepts.
+    Raises InputError: viser is not installed.
+    """
+    try:
+        import viser
+        import websockets.asyncio.server as websocket_server
+    except ImportError:
+        raise InputError('the viewer in the browser needs viser: pip install "jumper-warp[drive]"') from None
+    from viser._messages import ShareUrlRequest
+
+    serve = websocket_server.serve
+    websocket_server.serve = functools.partial(serve, origins=[ORIGIN])  # viser takes no origins
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # its table of addresses
+            server = viser.ViserServer(HOST, port, verbose=False)
+    finally:
+        websocket_server.serve = serve
+    server._websock_server.unregister_handler(ShareUrlRequest)
+    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    server.initial_camera.position = EYE
+    server.initial_camera.look_at = (0.0, 0.0, 0.25)
+    return server
 
 
 def glb_of(shapes: Sequence[ShapeMesh]) -> bytes:
@@ -92,4 +134,4 @@ def glb_of(shapes: Sequence[ShapeMesh]) -> bytes:
         surface = trimesh.Trimesh(shape.vertices, shape.triangles, vertex_normals=shape.normals, process=False)
         surface.visual = TextureVisuals(material=material)
         scene.add_geometry(surface, node_name=shape.name, geom_name=shape.name)
-    return scene.export(file_type="glb")
+    return cast("bytes", scene.export(file_type="glb"))
