@@ -9,21 +9,19 @@ from __future__ import annotations
 import html
 import queue
 import time
-from collections import deque
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jumper_warp.evaluation.trained import trained_bounds
+from jumper_warp.live.plots import Plots
 from jumper_warp.live.recordings import Take
 from jumper_warp.live.session import GROUNDS, MAX_VALUES, Session
-from jumper_warp.robot.description import LEGS
 from jumper_warp.robot.model import build_model
 from jumper_warp.viz.shapes import shape_meshes
-from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR, LEG_COLORS
 from jumper_warp.viz.viser import ViserScene
 
 if TYPE_CHECKING:
@@ -37,8 +35,7 @@ KEY_SPEEDS = np.array([0.6, 0.4, 0.8])  # [m/s], [m/s], [rad/s] Of a held key, a
 KEY_LABEL = "Keys, gamepad"  # Label of the text field through which the page's script sends keys and gamepad
 HELP = "**I K** ahead, back · **J L** turn · **U O** sideways · **T** jump up · **click** jump there · **R** reset"
 SHORT_HELP = "**R** reset · **P** pause · **N** single step · **V** record · **B** push"
-PLOT_SECONDS, PLOT_EVERY = (5.0, 3)  # [s] Time axis of the plots, and policy steps between two points
-REDRAW_EVERY = 6  # Policy steps between updates of one of the plots in turn
+PLOT_EVERY, REDRAW_EVERY = (3, 6)  # Policy steps between points of the plots, and between updates of one of them
 LATE = 0.1  # [s] Delay after which the clock restarts, instead of catching up
 
 
@@ -58,7 +55,8 @@ class Page:
         self.take: Take | None = None  # The recording under way
         self.status = server.gui.add_markdown("", order=-1.0)
         self.draw_ground()
-        self.plots = Plots(server, session)
+        self.plots = Plots(server, session, PLOT_EVERY)
+        server.gui.main_panel.dock_right()
         server.on_client_connect(lambda client: self.post(self.enter, client))
         server.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 
@@ -212,9 +210,9 @@ class Controls:
     def _add_commands(self) -> None:
         """Add sliders and buttons of the commands that the tasks take."""
         kinds = self.session.kinds()
+        task = self.session.tasks[0]
         if "walk" in kinds:
-            for bound in trained_bounds(self.session.tasks[0]):
-                label = f"{bound.name} [{bound.unit}]"
+            for bound, label in zip(trained_bounds(task), task.command.labels, strict=False):
                 slider = self.gui.add_slider(label, bound.low, bound.high, 0.05, 0.0)
                 slider.on_update(lambda event, i=bound.index: self.page.post(self._slide, i, event.target.value))
         if "jump up" in kinds:
@@ -224,7 +222,7 @@ class Controls:
                 "jump height [m]", round(bound.low, 2), round(bound.high, 2), 0.01, self.height
             )
             slider.on_update(lambda event: setattr(self, "height", event.target.value))
-            self._button("Jump up (T)", self._jump_up)
+            self._button("T jump up", self._jump_up)
         if not kinds:
             self._add_other_command()
 
@@ -238,13 +236,10 @@ class Controls:
         """Add controls of time, episode, ground and recording, and a button that hands the controls over."""
         pace = self.gui.add_slider("speed [1]", 0.1, 1.0, 0.05, self.page.speed)
         pace.on_update(lambda event: setattr(self.page, "speed", event.target.value))
-        ground = self.gui.add_dropdown("ground", GROUNDS, self.session.ground)
+        ground = self.gui.add_dropdown("ground", GROUNDS, initial_value=self.session.ground)
         ground.on_update(lambda event: self.page.post(self._change_ground, event.target.value))
-        self._button("Pause (P)", self._pause)
-        self._button("Single step (N)", self._single_step)
-        self._button("Reset (R)", self.session.reset)
-        self._button("Record, stop (V)", self._record)
-        self._button("Hand over", self.page.hand_over)
+        self._buttons("time", {"P pause": self._pause, "N step": self._single_step, "R reset": self.session.reset})
+        self._buttons("more", {"V record, stop": self._record, "Hand over": self.page.hand_over})
 
     def _add_values(self) -> None:
         """Add sliders of physical values, which act at once."""
@@ -257,7 +252,7 @@ class Controls:
         """Add a button that pushes the base, and sliders of force and direction."""
         force = self.gui.add_slider("push [N]", 0.0, 200.0, 5.0, 60.0)
         direction = self.gui.add_slider("direction [deg]", -180.0, 180.0, 15.0, 90.0, hint="0: ahead, 90: to the left")
-        self._button("Push (B)", lambda: self.session.push(force.value, direction.value))
+        self._button("B push", lambda: self.session.push(force.value, direction.value))
         self.push = lambda: self.session.push(force.value, direction.value)
 
     def _add_keys(self) -> None:
@@ -278,6 +273,11 @@ class Controls:
             actions["T"] = ("Jump up", self._jump_up)
         for key, (label, action) in actions.items():
             self.gui.add_command(label, hotkey=key).on_trigger(lambda event, act=action: self.page.post(act))  # pyright: ignore
+
+    def _buttons(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
+        """Add a row of buttons, each of which runs an action before the next step."""
+        group = self.gui.add_button_group(label, list(actions))
+        group.on_click(lambda event: self.page.post(actions[event.target.value]))
 
     def _button(self, label: str, action: Callable[[], object]) -> None:
         """Add a button that runs an action before the next step."""
@@ -302,7 +302,7 @@ class Controls:
             for component, sign in (KEYS[key] for key in text.split() if key in KEYS):
                 direction[component] += sign
         if direction.any():
-            self.session.jump = None
+            self.session.cancel_jump()
         self.session.velocity = direction * KEY_SPEEDS if direction.any() else self.sliders.copy()
 
     def _click(self, origin: tuple[float, ...], direction: tuple[float, ...]) -> None:
@@ -333,74 +333,9 @@ class Controls:
         self.page.draw_ground()
 
 
-class Plots:
-    """Plots of the last seconds, below the controls of every visitor."""
-
-    def __init__(self, server: ViserServer, session: Session) -> None:
-        """Add a tab for each plot."""
-        self.samples: deque[dict[str, float]] = deque(maxlen=round(PLOT_SECONDS / session.env.step_dt / PLOT_EVERY))
-        self.times: deque[float] = deque(maxlen=self.samples.maxlen)
-        self.sample(session)
-        self.turn = 0
-        self.handles = []
-        tabs = server.gui.add_tab_group(order=1000.0)
-        for title, group in (
-            ("Height", "height"), ("Velocity", "velocity"), ("Paws", "paw force"), ("Torque", "torque over limit"),
-            ("Reward", "reward of"),
-        ):  # fmt: skip
-            with tabs.add_tab(title):
-                names = self._names(group)
-                plot = server.gui.add_uplot(self._data(names), series_of(names), height=190)
-                self.handles.append([plot, group, names])
-
-    def sample(self, session: Session) -> None:
-        """Append the session's current values."""
-        self.samples.append(session.series())
-        self.times.append(self.times[-1] + PLOT_EVERY * session.env.step_dt if self.times else 0.0)
-
-    def redraw(self) -> None:
-        """Send the newest values of one plot, the next one in turn."""
-        handle = self.handles[self.turn]
-        self.turn = (self.turn + 1) % len(self.handles)
-        plot, group, names = handle
-        current = self._names(group)
-        if current != names:
-            handle[2] = current
-            plot.series = series_of(current)
-        plot.data = self._data(current)
-
-    def _names(self, group: str) -> list[str]:
-        """Return the names of a plot's curves: those with a value, of torques the largest of each leg."""
-        names = [name for name, value in self.samples[-1].items() if name.startswith(group)]
-        return [name for name in names if group != "reward of" or np.isfinite(self.samples[-1][name])]
-
-    def _data(self, names: list[str]) -> tuple[np.ndarray, ...]:
-        """Return the time axis [s] and the curves of a plot, (samples,) each."""
-        curves = [[sample.get(name, np.nan) for sample in self.samples] for name in names]
-        return tuple(np.array(values) for values in (self.times, *curves))
-
-
-def series_of(names: list[str]) -> tuple[Any, ...]:
-    """Return the settings of a plot's curves: labels and colours; names: `group/quantity [unit]`."""
-    import matplotlib
-
-    palette = [matplotlib.colors.to_hex(color) for color in matplotlib.colormaps["tab20"].colors]
-    series: list[Any] = [{"label": "time [s]"}]
-    for i, name in enumerate(names):
-        label = name.partition("/")[2]
-        leg = label[:2] if label[:2] in LEGS else ""
-        color = matplotlib.colors.to_hex(LEG_COLORS[leg]) if leg else palette[i % len(palette)]
-        if "commanded" in label:
-            color = matplotlib.colors.to_hex(COMMAND_COLOR)
-        elif len(names) == 2:
-            color = matplotlib.colors.to_hex(ACTUAL_COLOR)
-        series.append({"label": label, "stroke": color, "width": 1.5})
-    return tuple(series)
-
-
 @cache
 def script() -> str:
     """Return the script that runs in the driver's page and reports keys and gamepad."""
-    text = files(__package__).joinpath("keys.js").read_text()
+    text = files("jumper_warp.live").joinpath("keys.js").read_text()
     lines = [line for line in text.splitlines() if not line.strip().startswith("//")]
     return "\n".join(lines).replace("LABEL", f"'{KEY_LABEL}'").replace("KEYS", f"'{''.join(KEYS)}'")

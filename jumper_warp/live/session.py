@@ -36,7 +36,7 @@ TILE = TerrainCfg(tile=8.0, cell=0.05)  # Size and roughness of all grounds but 
 PUSH_TIME = 0.2  # [s] Duration of a push
 FALL_TIME = 1.5  # [s] Time from a fall to the reset
 TURNING, WALKING = (2.0, 1.5)  # [1/s] Gains of the approach to a goal: yaw rate over bearing, speed over distance
-APPROACH = (0.5, 1.0)  # [m/s], [rad/s] Largest speed and yaw rate of the approach
+SPEEDS, YAW_RATES = ((0.15, 0.5), (0.15, 1.0))  # [m/s], [rad/s] Smallest and largest of the approach
 BEARING = 0.06  # [rad] Largest bearing of a goal from which the robot jumps
 MAX_LATENCY = 40.0  # [ms] Largest latency that a driver can set
 MAX_VALUES = {"friction [1]": 1.5, "payload [kg]": 10.0, "gravity [m/s²]": 20.0, "latency [ms]": MAX_LATENCY}
@@ -192,6 +192,12 @@ class Session:
         else:
             self.jump = Jump(skill, goal=np.array(goal[:2], dtype=float))
 
+    def cancel_jump(self) -> None:
+        """Give up a jump to which the robot is on its way."""
+        if self.skill == 0 and self.jump is not None:
+            self.jump = None
+            self.env.episodes.requested_task.fill_(-1)
+
     def _command_jump(self, goal: np.ndarray) -> None:
         """Command the jump of a robot that only jumps; goal: x, y relative to base and heading, and height [m]."""
         if self.phase == LANDED:
@@ -238,11 +244,15 @@ class Session:
             ahead, *_ = trained_bounds(self.tasks[jump.skill])
             span = ahead.high - max(ahead.low, 0.0)
             distance = float(np.hypot(*offset))
-            excess = distance - np.clip(distance, max(ahead.low, 0.0) + 0.1 * span, max(ahead.low, 0.0) + 0.6 * span)
+            nearest = max(ahead.low, 0.0) + 0.1 * span
+            excess = distance - min(max(distance, nearest), nearest + 0.5 * span)
             bearing = float(np.arctan2(offset[1], offset[0]))
-            speed = np.clip(WALKING * excess, -APPROACH[0], APPROACH[0]) * (abs(bearing) < 0.5)
-            if abs(bearing) > BEARING or abs(excess) > 0.02:
-                return np.array([speed, 0.0, np.clip(TURNING * bearing, -APPROACH[1], APPROACH[1])])
+            if abs(bearing) > BEARING or abs(excess) > 0.0:
+                speed, turn = (
+                    float(np.sign(error) * np.clip(gain * abs(error), *bounds))
+                    for error, gain, bounds in ((excess, WALKING, SPEEDS), (bearing, TURNING, YAW_RATES))
+                )
+                return np.array([speed * (abs(bearing) < 0.5), 0.0, turn])
         jump.ready = True
         jump.waited += self.env.step_dt
         delay = round(SQUAT_TIME / self.env.step_dt)
@@ -297,7 +307,7 @@ class Session:
         previous = getattr(self, "skill", 0)
         self.skill = int(env.episodes.skill.numpy()[0])
         self.returned = previous != self.skill == 0  # whether walking has just taken over
-        if self.returned:
+        if self.returned and self.jump is not None and self.jump.ready:  # else it was requested during this jump
             self.jump = None
         self.poses = sim.links()[0].copy()
         self.position = self.poses[0, 0, :3].astype(float)

@@ -81,15 +81,9 @@ class ViserScene:
             mark.remove()
         ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, RING_HEIGHT, sections=48)
         lift = np.array([0.0, 0.0, RING_HEIGHT])
-        red, green, blue = (round(255 * part) for part in GOAL_COLOR)
+        color = np.round(255 * np.array(GOAL_COLOR)).astype(np.uint8)
         self.marks = [
-            self.scene.add_mesh_simple(
-                f"{ROOT}/goal_{i}",
-                ring.vertices,
-                ring.faces,
-                color=(red, green, blue),
-                position=goal + [0.0, 0.0, RING_HEIGHT],
-            )
+            self.scene.add_mesh_simple(f"{ROOT}/goal_{i}", ring.vertices, ring.faces, color=color, position=goal + lift)
             for i, goal in enumerate(goals)
         ]
 
