@@ -57,7 +57,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "trajectory.smoothing", "trajectory.whole_body",
     )),
     "viz": ("Recordings and pictures", (
-        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer",
+        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer", "viz.viser",
         "viz.scene", "viz.props", "viz.style",
     )),
     "utils": ("Errors and output", (

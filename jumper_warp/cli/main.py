@@ -33,6 +33,7 @@ COMMANDS = {
     "watch": "Show a training that runs or has ended: jumper watch RUN.",
     "finetune": "Reduce a jumping policy's errors by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
+    "drive": "Drive a robot from the browser.",
     "evaluate": "Measure a policy over many trials.",
     "export": "Save a policy, or the robot for other simulators.",
     "sysid": "Identify the robot's parameters from recorded motions.",

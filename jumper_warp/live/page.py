@@ -1,0 +1,341 @@
+"""Page in the browser on which a person drives a robot: scene, controls of the driver, plots and recordings.
+
+Every visitor sees the scene and the plots. The controls exist only for the driver, in that visitor's own interface, so
+that viser does not know them in messages of other visitors.
+"""
+
+from __future__ import annotations
+
+import html
+import queue
+import time
+from collections.abc import Callable
+from functools import cache, partial
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jumper_warp.evaluation.trained import trained_bounds
+from jumper_warp.live.plots import Plots
+from jumper_warp.live.recordings import Take
+from jumper_warp.live.session import GROUNDS, MAX_VALUES, Session
+from jumper_warp.robot.model import build_model
+from jumper_warp.viz.shapes import shape_meshes
+from jumper_warp.viz.viser import ViserScene
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from viser import ClientHandle, ViserServer
+
+KEYS = {"i": (0, 1.0), "k": (0, -1.0), "u": (1, 1.0), "o": (1, -1.0), "j": (2, 1.0), "l": (2, -1.0)}
+"""Component of the velocity and its sign by key: I ahead, K back, U, O to the sides, J, L turn."""
+KEY_SPEEDS = np.array([0.6, 0.4, 0.8])  # [m/s], [m/s], [rad/s] Of a held key, and of a gamepad's full deflection
+KEY_LABEL = "Keys, gamepad"  # Label of the text field through which the page's script sends keys and gamepad
+HELP = "**I K** ahead, back · **J L** turn · **U O** sideways · **T** jump up · **click** jump there · **R** reset"
+SHORT_HELP = "**R** reset · **P** pause · **N** single step · **V** record · **B** push"
+PLOT_EVERY, REDRAW_EVERY = (3, 6)  # Policy steps between points of the plots, and between updates of one of them
+LATE = 0.1  # [s] Delay after which the clock restarts, instead of catching up
+
+
+class Page:
+    """Page of a session, served by a viser server; `run` advances both in real time."""
+
+    def __init__(self, server: ViserServer, session: Session, folder: Path) -> None:
+        """Build scene and plots; the first visitor drives. folder: for recordings."""
+        self.server = server
+        self.session = session
+        self.folder = folder
+        self.requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self.visitors: dict[int, ClientHandle] = {}  # By id, in order of arrival; the first one drives
+        self.speed = 1.0  # Simulated over real time
+        self.paused = False
+        self.steps = 0
+        self.take: Take | None = None  # The recording under way
+        self.status = server.gui.add_markdown("", order=-1.0)
+        self.draw_ground()
+        self.plots = Plots(server, session, PLOT_EVERY)
+        server.gui.main_panel.dock_right()
+        server.on_client_connect(lambda client: self.post(self.enter, client))
+        server.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
+
+    def post(self, action: Callable[..., object], *args: object) -> None:
+        """Run an action before the next step, in the thread of `run`; callbacks of viser have threads of their own."""
+        self.requests.put(partial(action, *args))
+
+    def draw_ground(self) -> None:
+        """Draw the robot and the session's ground, in place of those drawn before."""
+        ground = "plane" if self.session.field is None else self.session.field
+        model = build_model(1, ground=ground, device="cpu", mujoco=False)
+        self.scene = ViserScene(self.server.scene, shape_meshes(model, (0,)))
+        self.model = model
+        self.shown_goal: np.ndarray | None = None
+        self.show()
+
+    # ------------------------------------------------------------------ visitors
+
+    def enter(self, client: ClientHandle) -> None:
+        """Give a new visitor the controls, if no one drives, else a notice."""
+        self.visitors[client.client_id] = client
+        if len(self.visitors) == 1:
+            Controls(self, client)
+        else:
+            client.gui.add_markdown("**You are watching.** Another visitor drives; you can turn the view.", order=0.0)
+
+    def leave(self, visitor: int) -> None:
+        """Stop the robot if its driver leaves, and give the next visitor the controls."""
+        drove = next(iter(self.visitors), None) == visitor
+        self.visitors.pop(visitor, None)
+        if drove:
+            self.session.velocity = np.zeros(3)
+            self.give_controls()
+
+    def hand_over(self) -> None:
+        """Give the controls to the next visitor, if there is one."""
+        if len(self.visitors) > 1:
+            driver = next(iter(self.visitors))
+            client = self.visitors.pop(driver)
+            client.gui.reset()
+            client.scene.remove_click_callback("all")
+            self.session.velocity = np.zeros(3)
+            self.give_controls()
+            self.enter(client)
+
+    def give_controls(self) -> None:
+        """Build the controls of the first visitor, if there is one."""
+        if self.visitors:
+            client = next(iter(self.visitors.values()))
+            client.gui.reset()
+            Controls(self, client)
+
+    # ------------------------------------------------------------------ loop
+
+    def run(self, seconds: float = np.inf) -> None:
+        """Simulate and show in real time for a duration [s]; nothing is simulated while there is no visitor."""
+        dt = self.session.env.step_dt
+        due = time.perf_counter()
+        end = due + seconds
+        while due < end:
+            while not self.requests.empty():
+                self.requests.get()()
+            if self.visitors and not self.paused:
+                self.advance()
+            due += dt / self.speed
+            wait = due - time.perf_counter()
+            if wait > 0.0:
+                time.sleep(wait)
+            elif wait < -LATE:
+                due = time.perf_counter()
+
+    def advance(self) -> None:
+        """Advance the session by one policy step, and show and record it."""
+        self.session.step()
+        self.steps += 1
+        with self.server.atomic():
+            self.show()
+            if self.steps % PLOT_EVERY == 0:
+                self.plots.sample(self.session)
+            if self.steps % REDRAW_EVERY == 0:
+                self.plots.redraw()
+                self.show_status()
+        if self.take is not None and not self.take.add(self.session):
+            self.finish_take()
+
+    def show(self) -> None:
+        """Show the robot and its goal; the viewer's origin follows the robot over the ground."""
+        session = self.session
+        self.scene.update(session.poses)
+        x, y = session.position[:2]
+        self.scene.follow(np.array([x, y, float(session.surface(np.array([x]), np.array([y]))[0])]))
+        goal = None if session.jump is None else session.jump.goal
+        if goal is not self.shown_goal:
+            self.shown_goal = goal
+            height = 0.0 if goal is None else float(session.surface(goal[:1], goal[1:])[0])
+            self.scene.show_goals([] if goal is None else [np.append(goal, height)])
+
+    def show_status(self) -> None:
+        """Show the active task, and a fall, a jump on its way or a recording."""
+        session = self.session
+        words = [session.tasks[session.skill].name]
+        words += [f"**fell: {session.fallen.replace('_', ' ')}**"] if session.fallen else []
+        words += ["to the jump"] if session.jump and session.skill == 0 else []
+        words += [f"recording {self.take.frames * self.take.step_dt:.0f} s"] if self.take else []
+        if (text := " · ".join(words)) != self.status.content:
+            self.status.content = text
+
+    def start_take(self) -> None:
+        """Begin a recording."""
+        self.take = self.take or Take(self.server, self.session, self.model, self.folder)
+
+    def finish_take(self) -> None:
+        """End the recording, write its files in the background, and show their folder to all visitors."""
+        take = self.take
+        self.take = None
+        if take is not None:
+            take.finish(self.tell)
+
+    def tell(self, title: str, text: str) -> None:
+        """Show a notification to all visitors."""
+        for client in list(self.visitors.values()):
+            client.add_notification(title, text, auto_close_seconds=8.0)
+
+
+class Controls:
+    """Controls of the driver, in that visitor's own interface."""
+
+    def __init__(self, page: Page, client: ClientHandle) -> None:
+        """Add all controls that fit the session's tasks."""
+        self.page = page
+        self.session = page.session
+        self.gui = client.gui
+        self.sliders = np.zeros(3)
+        self.height = 0.8  # [m] Commanded height of jumps up
+        self.gui.add_markdown(
+            HELP if len(page.session.tasks) > 1 else "**R** reset · **P** pause · **N** single step", order=0.0
+        )
+        self.status = self.gui.add_markdown("", order=1.0)
+        tabs = self.gui.add_tab_group(order=2.0)
+        with tabs.add_tab("Drive"):
+            self._add_commands()
+            self._add_clock()
+        with tabs.add_tab("Robot"):
+            self._add_values()
+            self._add_push()
+        self._add_keys()
+        self._add_shortcuts()
+        if "jump there" in self.session.kinds():
+            client.scene.on_click()(lambda event: self.page.post(self._click, event.ray_origin, event.ray_direction))
+
+    def _add_commands(self) -> None:
+        """Add sliders and buttons of the commands that the tasks take."""
+        kinds = self.session.kinds()
+        task = self.session.tasks[0]
+        if "walk" in kinds:
+            for bound, label in zip(trained_bounds(task), task.command.labels, strict=False):
+                slider = self.gui.add_slider(label, bound.low, bound.high, 0.05, 0.0)
+                slider.on_update(lambda event, i=bound.index: self.page.post(self._slide, i, event.target.value))
+        if "jump up" in kinds:
+            bound = trained_bounds(self.session.tasks[kinds["jump up"]])[0]
+            self.height = round(0.5 * (bound.low + bound.high), 2)
+            slider = self.gui.add_slider(
+                "jump height [m]", round(bound.low, 2), round(bound.high, 2), 0.01, self.height
+            )
+            slider.on_update(lambda event: setattr(self, "height", event.target.value))
+            self._button("T jump up", self._jump_up)
+        if not kinds:
+            self._add_other_command()
+
+    def _add_other_command(self) -> None:
+        """Add a number for each value of the command of a task that neither walks nor jumps."""
+        labels = self.session.tasks[0].command.labels or tuple(f"value {i + 1}" for i in range(4))
+        numbers = [self.gui.add_number(label, float(label == "quaternion w [1]"), step=0.05) for label in labels]
+        self._button("Command", lambda: self.session.command_values([number.value for number in numbers]))
+
+    def _add_clock(self) -> None:
+        """Add controls of time, episode, ground and recording, and a button that hands the controls over."""
+        pace = self.gui.add_slider("speed [1]", 0.1, 1.0, 0.05, self.page.speed)
+        pace.on_update(lambda event: setattr(self.page, "speed", event.target.value))
+        ground = self.gui.add_dropdown("ground", GROUNDS, initial_value=self.session.ground)
+        ground.on_update(lambda event: self.page.post(self._change_ground, event.target.value))
+        self._buttons("time", {"P pause": self._pause, "N step": self._single_step, "R reset": self.session.reset})
+        self._buttons("more", {"V record, stop": self._record, "Hand over": self.page.hand_over})
+
+    def _add_values(self) -> None:
+        """Add sliders of physical values, which act at once."""
+        for name, most in MAX_VALUES.items():
+            now = (self.session.nominal | self.session.values)[name]
+            slider = self.gui.add_slider(name, 0.0, max(most, round(now, 2)), 0.01 * most, round(now, 2))
+            slider.on_update(lambda event, name=name: self.page.post(self.session.set_value, name, event.target.value))
+
+    def _add_push(self) -> None:
+        """Add a button that pushes the base, and sliders of force and direction."""
+        force = self.gui.add_slider("push [N]", 0.0, 200.0, 5.0, 60.0)
+        direction = self.gui.add_slider("direction [deg]", -180.0, 180.0, 15.0, 90.0, hint="0: ahead, 90: to the left")
+        self._button("B push", lambda: self.session.push(force.value, direction.value))
+        self.push = lambda: self.session.push(force.value, direction.value)
+
+    def _add_keys(self) -> None:
+        """Add the script that watches keys and gamepad, and the text field through which it reports them."""
+        if "walk" not in self.session.kinds():
+            return
+        field = self.gui.add_text(KEY_LABEL, "", order=3.0)
+        field.on_update(lambda event: self.page.post(self._hold, event.target.value))
+        self.gui.add_html(f'<img style="display: none" src="data:," onerror="{html.escape(script())}">', order=4.0)
+
+    def _add_shortcuts(self) -> None:
+        """Add keyboard shortcuts of buttons, which viser's command palette (Ctrl+K) lists too."""
+        actions = {
+            "R": ("Reset", self.session.reset), "P": ("Pause", self._pause), "N": ("Single step", self._single_step),
+            "V": ("Record, stop", self._record), "B": ("Push", self.push),
+        }  # fmt: skip
+        if "jump up" in self.session.kinds():
+            actions["T"] = ("Jump up", self._jump_up)
+        for key, (label, action) in actions.items():
+            self.gui.add_command(label, hotkey=key).on_trigger(lambda event, act=action: self.page.post(act))  # pyright: ignore
+
+    def _buttons(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
+        """Add a row of buttons, each of which runs an action before the next step."""
+        group = self.gui.add_button_group(label, list(actions))
+        group.on_click(lambda event: self.page.post(actions[event.target.value]))
+
+    def _button(self, label: str, action: Callable[[], object]) -> None:
+        """Add a button that runs an action before the next step."""
+        self.gui.add_button(label).on_click(lambda event: self.page.post(action))
+
+    # ------------------------------------------------------------------ actions, in the thread of the loop
+
+    def _slide(self, component: int, value: float) -> None:
+        """Command the velocity of the sliders."""
+        self.sliders[component] = value
+        self.session.velocity = self.sliders.copy()
+
+    def _hold(self, text: str) -> None:
+        """Command the velocity of held keys or a gamepad, such as `i l` or `pad 0.5 0.0 0.2`; if none, the sliders'."""
+        first, *rest = text.split() or [""]
+        direction = np.zeros(3)
+        if first == "pad":
+            direction = np.array(rest[:3], dtype=float)
+            if rest[3:] and "jump up" in self.session.kinds():
+                self._jump_up()
+        else:
+            for component, sign in (KEYS[key] for key in text.split() if key in KEYS):
+                direction[component] += sign
+        if direction.any():
+            self.session.cancel_jump()
+        self.session.velocity = direction * KEY_SPEEDS if direction.any() else self.sliders.copy()
+
+    def _click(self, origin: tuple[float, ...], direction: tuple[float, ...]) -> None:
+        """Jump to the clicked point of the ground."""
+        goal = self.session.ground_point(*self.page.scene.world_ray(origin, direction))
+        if goal is not None:
+            self.session.jump_to(goal)
+
+    def _jump_up(self) -> None:
+        self.session.jump_up(self.height)
+
+    def _pause(self) -> None:
+        self.page.paused = not self.page.paused
+
+    def _single_step(self) -> None:
+        self.page.paused = True
+        self.page.advance()
+
+    def _record(self) -> None:
+        if self.page.take is None:
+            self.page.start_take()
+        else:
+            self.page.finish_take()
+
+    def _change_ground(self, ground: str) -> None:
+        self.page.finish_take()
+        self.session.build(ground)
+        self.page.draw_ground()
+
+
+@cache
+def script() -> str:
+    """Return the script that runs in the driver's page and reports keys and gamepad."""
+    text = files("jumper_warp.live").joinpath("keys.js").read_text()
+    lines = [line for line in text.splitlines() if not line.strip().startswith("//")]
+    return "\n".join(lines).replace("LABEL", f"'{KEY_LABEL}'").replace("KEYS", f"'{''.join(KEYS)}'")

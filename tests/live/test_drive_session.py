@@ -1,0 +1,187 @@
+"""A driven robot: velocities, jumps to clicked places, physical values, pushes, grounds, and other tasks."""
+
+import json
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation.conditions import Conditions
+from jumper_warp.evaluation.skills import SkillNames
+from jumper_warp.live.session import Session, load
+
+CPU = Conditions(device="cpu", threads=1)
+
+
+def session_of(*names, agent="policy", conditions=CPU):
+    """Return a session of policies, or of other sources for another agent."""
+    recipes, policies = zip(*(load(name, agent) for name in names), strict=True)
+    return Session(recipes, policies, conditions, agent=agent)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    """Return a robot that walks and jumps, for all tests of this module."""
+    return session_of(*astuple(SkillNames()))
+
+
+@pytest.fixture
+def session(walker):
+    """Return the robot with its physical values as built, at the start of an episode."""
+    walker.values = dict(walker.nominal)
+    walker.velocity = np.zeros(3)
+    walker.reset()
+    walker.values = {}
+    return walker
+
+
+def advance(session, seconds):
+    """Advance a session by some time [s]; return the largest height of the base [m]."""
+    heights = []
+    for _ in range(round(60 * seconds)):
+        session.step()
+        heights.append(session.position[2])
+    return max(heights)
+
+
+def finish_jump(session, seconds=10.0):
+    """Advance a session until its jump is over, at most some time [s]; return the largest height of the base [m]."""
+    heights = []
+    for _ in range(round(60 * seconds)):
+        session.step()
+        heights.append(session.position[2])
+        if session.jump is None or session.fallen:
+            break
+    return max(heights)
+
+
+def test_robot_follows_the_commanded_velocity(session):
+    session.velocity = np.array([0.5, 0.0, 0.0])
+    advance(session, 2.0)
+    assert 0.6 < session.position[0] < 1.0
+    assert session.series()["velocity/ahead [m/s]"] == pytest.approx(0.5, abs=0.15)
+
+
+@pytest.mark.parametrize("goal", [(1.0, 0.0), (-0.8, 0.3), (0.1, 2.8)], ids=["ahead", "behind", "far to the left"])
+def test_robot_lands_within_5_cm_of_its_goal(session, goal):
+    session.jump_to(np.array(goal))
+    assert finish_jump(session) > 0.42  # it jumps
+    assert not session.fallen
+    assert np.linalg.norm(session.position[:2] - goal) < 0.05
+
+
+def test_jump_up_reaches_the_commanded_height(session):
+    session.jump_up(0.9)
+    assert finish_jump(session) == pytest.approx(0.9, abs=0.1)
+
+
+def test_cancelled_jump_does_not_happen(session):
+    session.jump_up(0.9)
+    session.step()
+    session.cancel_jump()
+    assert advance(session, 2.0) < 0.45
+
+
+def test_payload_and_gravity_act_at_once(session):
+    advance(session, 0.5)
+    before = sum(value for name, value in session.series().items() if name.startswith("paw force"))
+    session.set_value("payload [kg]", 3.0)
+    session.set_value("gravity [m/s²]", 5.0)
+    advance(session, 1.0)
+    after = sum(value for name, value in session.series().items() if name.startswith("paw force"))
+    assert after == pytest.approx((before / 9.81 + 3.0) * 5.0, rel=0.02)
+
+
+def test_values_of_the_driver_outlast_a_reset(session):
+    session.set_value("latency [ms]", 10.0)
+    session.set_value("friction [1]", 0.2)
+    session.reset()
+    parameters = session.env.parameters
+    assert parameters.latency.numpy()[0] == 5  # physics steps of 1/480 s
+    assert parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()] == pytest.approx(0.2)
+
+
+def test_friction_changes_a_landing(session):
+    errors = []
+    for friction in (0.9, 0.1):
+        session.reset()
+        session.set_value("friction [1]", friction)
+        session.jump_to(np.array([1.2, 0.0]))
+        finish_jump(session)
+        errors.append(np.linalg.norm(session.position[:2] - [1.2, 0.0]))
+    assert errors[0] < 0.05 < errors[1]
+
+
+def test_push_moves_the_robot_in_its_direction(session):
+    session.push(60.0, 90.0)
+    session.step()
+    assert session.env.parameters.push.numpy()[0, 1] == pytest.approx(60.0, abs=1.0)
+    advance(session, 0.3)
+    assert session.position[1] > 0.01
+    assert not session.env.parameters.push.numpy().any()
+
+
+def test_clicked_point_is_on_the_ground(session):
+    eye = np.array([-1.0, 0.0, 2.0])
+    np.testing.assert_allclose(session.ground_point(eye, np.array([1.0, 0.0, -1.0])), [1.0, 0.0, 0.0], atol=1e-6)
+    assert session.ground_point(eye, np.array([1.0, 0.0, 0.1])) is None
+
+
+def test_robot_begins_anew_on_another_ground(walker):
+    walker.build("stairs")
+    try:
+        advance(walker, 0.3)
+        point = walker.ground_point(np.array([0.0, 0.0, 3.0]), np.array([1.0, 0.0, -1.0]))
+        assert point[2] == pytest.approx(walker.surface(point[:1], point[1:2])[0], abs=0.02)
+        assert abs(point[2]) > 0.02  # beyond the level middle
+        assert not walker.fallen
+    finally:
+        walker.build("flat")
+
+
+def test_fallen_robot_is_reset(session):
+    session.push(1500.0, 90.0)
+    for _ in range(120):
+        session.step()
+        if session.fallen:
+            break
+    assert session.fallen
+    advance(session, 1.6)
+    assert not session.fallen
+    assert abs(session.position[1]) < 0.1
+
+
+def test_reward_terms_of_the_active_task_have_values(session):
+    advance(session, 0.1)
+    terms = {name: value for name, value in session.series().items() if name.startswith("reward of ")}
+    assert all(np.isfinite(value) == name.startswith("reward of velocity-flat/") for name, value in terms.items())
+
+
+def test_policy_that_only_jumps_is_commanded(tmp_path):
+    session = session_of(SkillNames().jump_to)
+    assert list(session.kinds()) == ["jump there"]
+    session.jump_to(np.array([0.8, 0.0]))
+    advance(session, 3.0)
+    assert np.linalg.norm(session.position[:2] - [0.8, 0.0]) < 0.05
+    session.jump_to(np.array([1.6, 0.0]))
+    advance(session, 3.0)
+    assert np.linalg.norm(session.position[:2] - [1.6, 0.0]) < 0.08
+
+
+def test_recipe_file_is_simulated_in_the_default_pose(tmp_path):
+    from jumper_warp.recipe import Recipe
+
+    path = tmp_path / "recipe.json"
+    path.write_text(json.dumps(Recipe.of("velocity-flat").to_json()))
+    session = session_of(str(path), agent="hold")
+    advance(session, 0.5)
+    assert not session.fallen
+    assert session.series()["velocity/ahead [m/s]"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_task_without_sliders_takes_the_values_of_its_labels():
+    session = session_of("attitude", agent="random")
+    assert session.kinds() == {}
+    session.command_values([0.0, 0.0, 0.0, 1.0])
+    advance(session, 0.2)
+    assert np.isfinite(session.poses).all()
