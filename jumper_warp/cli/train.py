@@ -65,7 +65,7 @@ class TrainArgs:
     minutes."""
     watch: bool = False
     """Show the training while it runs: robots, reward terms and learning curves. `jumper watch RUN` joins later."""
-    viewer: Literal["rerun"] = "rerun"  # Viewer of --watch
+    viewer: Literal["rerun", "viser"] = "rerun"  # Viewer of --watch: the Rerun viewer, or a page in the browser
     video_every: int = 0  # Iterations between two films in the run's folder; 0: none
 
 
@@ -237,7 +237,8 @@ def watches(args: Sequence[str]) -> list[TrainingWatch]:
         return []
     from jumper_warp.live.training import TrainingWatch
 
-    return [TrainingWatch("rerun" if watched else "none", max(every, 0))]
+    viewer: Any = (values_of("--viewer", args) or ["rerun"])[-1]
+    return [TrainingWatch(viewer if watched else "none", max(every, 0))]
 
 
 def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:

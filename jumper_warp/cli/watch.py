@@ -21,7 +21,7 @@ class WatchArgs:
 
     seconds: float | None = None  # [s] Time after which to end (default: until Ctrl-C)
     device: str = "cpu"  # Device on which a checkpoint is simulated
-    viewer: Literal["rerun"] = "rerun"  # Viewer that shows the robots
+    viewer: Literal["rerun", "viser"] = "rerun"  # The Rerun viewer, or a page in the browser
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -34,7 +34,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     cfg = parse(WatchArgs, "watch RUN", args[named:])
     if not named:
         raise UsageError("the run comes first: jumper watch RUN [flags]")
-    from jumper_warp.live.rerun_view import live_address
+    from jumper_warp.live.feed import live_address
     from jumper_warp.viz.rerun_server import announce
 
     if address := live_address(Path(args[0])):
@@ -46,4 +46,4 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     folder = find_policy(newest_run(args[0]))
     configure_device(cfg.device)
-    watch_checkpoints(folder, cfg.device, modules, cfg.seconds)
+    watch_checkpoints(folder, cfg.device, modules, cfg.seconds, cfg.viewer)

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 
 from jumper_warp.live.buffer import WorldBuffer
-from jumper_warp.live.feed import Feed, Steps
+from jumper_warp.live.feed import Feed, Steps, Viewer
 from jumper_warp.live.training import setup_of
 from jumper_warp.policies.policy import Policy
 from jumper_warp.recipe import Recipe
@@ -24,7 +24,9 @@ WORLDS = 16  # Number of simulated robots
 STEPS = 6  # Policy steps between two messages to the viewer
 
 
-def watch_checkpoints(run: Path, device: str, modules: Iterable[ModuleType] = (), seconds: float | None = None) -> None:
+def watch_checkpoints(
+    run: Path, device: str, modules: Iterable[ModuleType] = (), seconds: float | None = None, viewer: Viewer = "rerun"
+) -> None:
     """Simulate the newest checkpoint of a run's folder in real time in a viewer, without exploration noise.
 
     Worlds have curriculum levels of the checkpoint's worlds. modules: the user's task modules. seconds: time after
@@ -40,7 +42,7 @@ def watch_checkpoints(run: Path, device: str, modules: Iterable[ModuleType] = ()
     env.reset(worlds=range(WORLDS))
     buffer = WorldBuffer(env, STEPS)
     env.step_hooks.append(buffer.record)
-    feed = Feed(setup_of(buffer, [run], float(last_metrics(run).get("Perf/elapsed_s", 0.0))))
+    feed = Feed(setup_of(buffer, [run], float(last_metrics(run).get("Perf/elapsed_s", 0.0)), viewer=viewer))
     begin = time.monotonic()
     policy: Policy | None = None
     steps = 0

@@ -7,7 +7,9 @@ import pickle
 import subprocess
 import sys
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Literal, NamedTuple
@@ -16,8 +18,13 @@ import numpy as np
 
 from jumper_warp.live.clips import Layout
 from jumper_warp.live.scene import RobotScene
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.rerun_server import is_served
 
+ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
 QUEUED = 8  # Largest number of iterations that wait for the viewer; older ones are dropped
+Viewer = Literal["rerun", "viser", "none"]
 PACKAGES = Path(__file__).parents[2]  # Folder that Python searches for this package
 
 
@@ -44,9 +51,30 @@ class Setup:
     goal: str  # field of the state that is marked in the scene; empty: none
     step_dt: float  # [s] policy step
     elapsed: float  # [s] training time so far
-    viewer: Literal["rerun", "none"] = "rerun"
+    viewer: Viewer = "rerun"
     video_every: int = 0  # iterations between two films; 0: none
     wandb: str | None = None  # project of Weights & Biases for the films
+
+    def __post_init__(self) -> None:
+        """Raise InputError: viser is asked for and not installed."""
+        if self.viewer == "viser" and find_spec("viser") is None:
+            raise InputError('--viewer viser needs viser: pip install "jumper-warp[drive]"')
+
+
+def write_address(folders: Sequence[Path], url: str, page: str) -> None:
+    """Write the addresses of a live view to the runs' folders, where `jumper watch` finds them."""
+    for folder in folders:
+        write_atomically(folder / ADDRESS, f"{url}\n{page}\n".encode())
+
+
+def live_address(run: Path) -> tuple[str, str] | None:
+    """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
+    files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
+    for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
+        url, page = file.read_text().splitlines()
+        if is_served(url):
+            return url, page
+    return None
 
 
 class Feed:

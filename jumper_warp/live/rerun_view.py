@@ -11,47 +11,27 @@ Entities; times are training times [s], so that robots and curves share the time
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from jumper_warp.live.curves import GROUPS, curves_of
 from jumper_warp.live.scene import RobotScene
-from jumper_warp.utils.files import write_atomically
-from jumper_warp.viz.rerun_server import is_served
 from jumper_warp.viz.shapes import ShapeMesh
-from jumper_warp.viz.style import BASE_COLOR, GOAL_COLOR, LEG_COLORS
+from jumper_warp.viz.style import GOAL_COLOR, SERIES_COLORS
 
-ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
 TIMELINE = "time"
 RING = 0.1 * np.stack([np.cos(a := np.linspace(0.0, 2.0 * np.pi, 25)), np.sin(a), 0.0 * a], axis=1)  # [m]
 ABOVE = np.array([0.0, 0.0, 0.3])  # [m] from a robot's base to its name
-PALETTE = np.array(
-    [*LEG_COLORS.values(), (0.34, 0.71, 0.91), (0.84, 0.37, 0.0), (0.94, 0.89, 0.26), (0.5, 0.5, 0.5), BASE_COLOR]
-)
 EYE = np.array([3.2, -1.0, 1.9])  # [m] camera, from the middle of the robots
-GROUPS = {
-    "Train/mean_reward": "reward", "Metrics/": "metrics", "Episode_Termination/": "terminations",
-    "Episode_Reward/": "reward terms", "Episode_Sum/": "reward terms", "Curriculum/": "curriculum",
-    "Loss/": "losses", "Perf/total_fps": "speed",
-}  # fmt: skip
-"""Group of curves by the beginning of the metric's name; other metrics are not shown."""
-
-
-def live_address(run: Path) -> tuple[str, str] | None:
-    """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
-    files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
-    for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
-        url, page = file.read_text().splitlines()
-        if is_served(url):
-            return url, page
-    return None
 
 
 class RerunView:
     """View of the robots of several slots in a Rerun stream."""
+
+    rate = 8.0  # [1/s] updates of the robots; each brings all poses since the last one
 
     def __init__(self, stream: Any, scene: RobotScene, names: Sequence[str], terms: Sequence[str]) -> None:
         """Log everything that does not change; stream: a `RecordingStream`; names: of the slots; terms: of rewards."""
@@ -64,7 +44,7 @@ class RerunView:
         stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for body, entity in enumerate(["scene/ground", *self._links], start=-1):
             stream.log(entity, _mesh([shape for shape in scene.shapes if shape.body == body]), static=True)
-        colors = PALETTE[np.arange(len(terms)) % len(PALETTE)]
+        colors = np.array(SERIES_COLORS)[np.arange(len(terms)) % len(SERIES_COLORS)]
         places = [[len(names) + 0.2, 1.0 - 2.0 * i / max(len(terms) - 1, 1)] for i in range(len(terms))]
         legend = rr.Points2D(_upright(places), labels=self._terms, colors=_rgb(colors), radii=0.03, show_labels=True)
         stream.log("rewards/legend", legend, static=True)
@@ -105,18 +85,11 @@ class RerunView:
 
     def show_curves(self, lines: Sequence[dict[str, Any]], label: str = "") -> None:
         """Append lines of a metrics file to the curves; label: of the seed, empty for a single one."""
-        curves: dict[str, list[tuple[float, float]]] = {}
-        for line in lines:
-            when = line.get("Perf/elapsed_s") or 0.0
-            for name, value in line.items():
-                group = next((group for start, group in GROUPS.items() if name.startswith(start)), None)
-                if group is not None and value is not None:
-                    entity = f"curves/{group}/{name.split('/')[-1]}{label}"
-                    curves.setdefault(entity, []).append((when, value))
-        for entity, points in curves.items():
+        for (group, name), points in curves_of(lines, label).items():
             when, values = np.array(points).T
             column = [rr.TimeColumn(TIMELINE, duration=when)]
-            self._stream.send_columns(rr.new_entity_path(entity.split("/")), column, rr.Scalars.columns(scalars=values))
+            entity = rr.new_entity_path(["curves", group, name])
+            self._stream.send_columns(entity, column, rr.Scalars.columns(scalars=values))
 
     def show_status(self, text: str) -> None:
         """Show a text in Markdown."""
@@ -140,12 +113,6 @@ def blueprint() -> rrb.Blueprint:
     panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following")
     layout = rrb.Horizontal(left, right, column_shares=[3, 2])
     return rrb.Blueprint(layout, panel, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
-
-
-def write_address(folders: Sequence[Path], url: str, page: str) -> None:
-    """Write the addresses of a live view to the runs' folders, where `jumper watch` finds them."""
-    for folder in folders:
-        write_atomically(folder / ADDRESS, f"{url}\n{page}\n".encode())
 
 
 def _mesh(shapes: Sequence[ShapeMesh]) -> rr.Mesh3D:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from jumper_warp.live.buffer import WorldBuffer
 from jumper_warp.live.clips import SHOWN_RUNS
-from jumper_warp.live.feed import Feed, Setup, Steps
+from jumper_warp.live.feed import Feed, Setup, Steps, Viewer
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.rl.run_names import title
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class TrainingWatch:
     """Observer of one training, or of several seeds side by side; see `jumper_warp.rl.runner.Observer`."""
 
-    def __init__(self, viewer: Literal["rerun", "none"] = "rerun", video_every: int = 0) -> None:
+    def __init__(self, viewer: Viewer = "rerun", video_every: int = 0) -> None:
         """Prepare to show a training; video_every: iterations between two films, 0: none."""
-        self._viewer: Literal["rerun", "none"] = viewer
+        self._viewer = viewer
         self._video_every = video_every
         self.feed: Feed | None = None
         self._buffers: list[WorldBuffer] = []

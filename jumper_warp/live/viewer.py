@@ -5,56 +5,51 @@ It imports neither PyTorch nor Warp, and ends with its input.
 
 from __future__ import annotations
 
-import json
 import pickle
 import sys
 import time
 from collections import deque
-from pathlib import Path
+from collections.abc import Sequence
+from contextlib import ExitStack
 from threading import Thread
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
 from jumper_warp.live.clips import ROLES, SHOWN_RUNS, Player
-from jumper_warp.live.feed import Setup, Steps
+from jumper_warp.live.curves import MetricsTail
+from jumper_warp.live.feed import Setup, Steps, write_address
 from jumper_warp.live.films import Films
-from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.viz.rerun_server import RerunServer, announce
 
-if TYPE_CHECKING:
-    from jumper_warp.live.rerun_view import RerunView
-
-RATE = 8.0  # [1/s] Updates of the robots; each brings all policy steps since the last one
 SKIPPED = 2  # Policy steps from one shown pose to the next
 SPACING = 1.4  # [m] Distance between robots
 REACH = 1.2  # [m] Horizontal distance from its place at which a robot is held, so that it stays in view
-CURVES_EVERY = 8  # Updates between two reads of the metrics files
+CURVES_EVERY, REWARDS_EVERY = (1.0, 0.25)  # [s] Time between two reads of the metrics files, and updates of the bars
 
 
-class MetricsTail:
-    """Reader of the lines that a training appends to its metrics file."""
+class View(Protocol):
+    """View of watched worlds, see `RerunView` for the arguments."""
 
-    def __init__(self, folder: Path) -> None:
-        """Begin at the start of the file, which may not exist yet."""
-        self._path = folder / METRICS_FILE
-        self._read = 0
+    rate: float
 
-    def lines(self) -> list[dict[str, Any]]:
-        """Return the complete lines since the last call."""
-        if not self._path.is_file():
-            return []
-        with self._path.open("rb") as file:
-            file.seek(self._read)
-            content = file.read()
-        end = content.rfind(b"\n") + 1
-        self._read += end
-        return [json.loads(line) for line in content[:end].splitlines()]
+    def show(self, times: np.ndarray, poses: np.ndarray, goals: np.ndarray) -> None:
+        """Show the robots."""
+
+    def show_rewards(self, when: float, sums: np.ndarray) -> None:
+        """Show stacked bars of the reward terms."""
+
+    def show_curves(self, lines: Sequence[dict[str, Any]], label: str = "") -> None:
+        """Append lines of a metrics file to the curves."""
+
+    def show_status(self, text: str) -> None:
+        """Show a text in Markdown."""
 
 
 class Show:
     """State of the viewer: players of all slots, metrics files, a view if there is one, and films."""
 
-    def __init__(self, setup: Setup, view: RerunView | None) -> None:
+    def __init__(self, setup: Setup, view: View | None) -> None:
         """Prepare to show runs; view: None if only films are made."""
         self.setup = setup
         self._view = view
@@ -96,9 +91,9 @@ class Show:
             times = setup.elapsed + setup.step_dt * np.arange(self._frames - count + 1, self._frames + 1)
             shown = slice((count - 1) % SKIPPED, None, SKIPPED)
             view.show(times[shown], *self._drawn(np.stack(rows, axis=1)[shown], players))
-            if self._updates % 2 == 0:
+            if self._updates % round(REWARDS_EVERY * view.rate) == 0:
                 view.show_rewards(times[-1], np.stack([player.terms for player in players]))
-        if self._updates % CURVES_EVERY == 0:
+        if self._updates % round(CURVES_EVERY * view.rate) == 0:
             labels = [f", {title}" if len(self._tails) > 1 else "" for title in setup.titles]
             for tail, label in zip(self._tails, labels, strict=True):
                 view.show_curves(tail.lines(), label)
@@ -150,25 +145,42 @@ def main() -> None:
     """Show what the standard input brings, until it ends."""
     source = sys.stdin.buffer
     setup: Setup = pickle.load(source)
-    server = stream = view = None
-    if setup.viewer == "rerun":
-        import rerun as rr
+    single = len(setup.folders) == 1
+    runs = setup.titles[:SHOWN_RUNS]
+    names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]
+    view: View | None = None
+    with ExitStack() as cleanup:
+        if setup.viewer != "none":
+            view, url, page = open_view(setup, names, cleanup)
+            write_address(setup.folders, url, page)
+            announce(url, page)
+        run(Show(setup, view), source, 8.0 if view is None else view.rate)
 
-        from jumper_warp.live.rerun_view import RerunView, write_address
-        from jumper_warp.viz.rerun_server import RerunServer, announce
 
-        server = RerunServer()
-        stream = rr.RecordingStream("jumper-warp watch")
-        stream.connect_grpc(server.url)
-        single = len(setup.folders) == 1
-        runs = setup.titles[:SHOWN_RUNS]
-        names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]
-        view = RerunView(stream, setup.scene, names, setup.terms)
-        write_address(setup.folders, server.url, server.page)
-        announce(server.url, server.page)
+def open_view(setup: Setup, names: Sequence[str], cleanup: ExitStack) -> tuple[View, str, str]:
+    """Return the view that a setup names, its address and that of a page in the browser; names: of the slots."""
+    if setup.viewer == "viser":
+        from jumper_warp.live.viser_view import ViserView
+
+        page = ViserView(setup.scene, names, setup.terms)
+        cleanup.callback(page.close)
+        return page, page.url, page.page
+    import rerun as rr
+
+    from jumper_warp.live.rerun_view import RerunView
+
+    server = RerunServer()
+    cleanup.callback(server.close)
+    stream = rr.RecordingStream("jumper-warp watch")
+    stream.connect_grpc(server.url)
+    cleanup.callback(stream.disconnect)
+    return RerunView(stream, setup.scene, names, setup.terms), server.url, server.page
+
+
+def run(show: Show, source: BinaryIO, rate: float) -> None:
+    """Show the messages of a stream until it ends; rate: of updates [1/s]."""
     inbox: deque[Any] = deque(maxlen=64)
     Thread(target=read_messages, args=(source, inbox), daemon=True).start()
-    show = Show(setup, view)
     ended = False
     while not ended:
         started = time.monotonic()
@@ -178,11 +190,8 @@ def main() -> None:
             if not ended:
                 show.add(message)
         show.update()
-        time.sleep(max(0.0, started + 1.0 / RATE - time.monotonic()))
+        time.sleep(max(0.0, started + 1.0 / rate - time.monotonic()))
     show.end()
-    if server is not None and stream is not None:
-        stream.disconnect()
-        server.close()
 
 
 if __name__ == "__main__":

@@ -63,10 +63,9 @@ def free_port() -> int:
 
 def is_served(url: str) -> bool:
     """Return whether a server listens at the address of `RerunServer.url`."""
-    host, _, port = url.removeprefix("rerun+http://").removesuffix("/proxy").partition(":")
     try:
-        create_connection((host, int(port)), 1.0).close()
-    except (OSError, ValueError):
+        create_connection((LOOPBACK, int(port_of(url))), 1.0).close()
+    except OSError:
         return False
     return True
 
@@ -83,10 +82,13 @@ def viewer_command(source: str | Path) -> list[str]:
 
 
 def announce(url: str, page: str) -> subprocess.Popen | None:
-    """Print the addresses of a live view; open a window that outlives this process if there is a display, return it."""
-    ports = " ".join(f"-L {part}:{LOOPBACK}:{part}" for part in (port_of(page), port_of(url)))
+    """Print the addresses of a live view; open and return a window of the Rerun viewer, if url is for it.
+
+    The window outlives this process. None: there is no display, or the view is a page only.
+    """
+    ports = " ".join(f"-L {part}:{LOOPBACK}:{part}" for part in dict.fromkeys((port_of(page), port_of(url))))
     print(f"watch: {page} in a browser; on another computer after ssh {ports} HOST", file=sys.stderr, flush=True)
-    if not has_display():
+    if not has_display() or not url.startswith("rerun"):
         return None
     return subprocess.Popen(viewer_command(url), stdin=subprocess.DEVNULL, start_new_session=True, **QUIET)
 

@@ -2,7 +2,6 @@
 
 import os
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,13 +13,11 @@ from jumper_warp.live.buffer import WorldBuffer
 from jumper_warp.live.clips import ROLES, Player
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
-from jumper_warp.recipe import Recipe
-from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.training import train
+from live_helpers import STEPS, short_training
 from toy_task import equal
 
-STEPS = 8  # policy steps of an iteration
 LAYOUT = {"world": (0, 1), "done": (1, 2), "rewards": (2, 3)}
 
 
@@ -142,15 +139,6 @@ def test_player_drops_an_episode_with_lost_steps():
     assert shown(player, 4) == [1, 2, 1, 2]
 
 
-@pytest.fixture(scope="module")
-def recipe():
-    """Return the settings of a training of 4 iterations."""
-    ppo = PpoCfg(num_steps=STEPS, hidden=(16, 16), minibatches=2, epochs=1)
-    cfg = TrainCfg(task="hold-height", num_envs=8, max_iterations=4, device="cpu", log_interval=2, save_interval=2,
-                   tensorboard=False, ppo=ppo)  # fmt: skip
-    return Recipe(hold_height(), cfg)
-
-
 class KilledWatch(TrainingWatch):
     """Watch whose viewer is killed after the second iteration."""
 
@@ -161,16 +149,16 @@ class KilledWatch(TrainingWatch):
             self.feed.process.wait()
 
 
-def final_state(recipe, folder, observers=()):
+def final_state(folder, observers=()):
     """Train, and return the state in the last checkpoint without settings and time."""
-    result = train(replace(recipe, train=replace(recipe.train, log_root=folder)), observers=observers)
+    result = train(short_training(folder), observers=observers)
     state = load_checkpoint(result.folder / "checkpoints" / "iteration_000004.pt")
     return {name: state[name] for name in ("iteration", "ppo", "env", "rng")}
 
 
-def test_training_is_bitwise_the_same_with_a_viewer_and_after_it_is_killed(recipe, tmp_path):
-    plain = final_state(recipe, tmp_path / "plain")
+def test_training_is_bitwise_the_same_with_a_viewer_and_after_it_is_killed(tmp_path):
+    plain = final_state(tmp_path / "plain")
     for watch in (TrainingWatch("none", 1), KilledWatch("none", 1)):
-        state = final_state(recipe, tmp_path / type(watch).__name__, [watch])
+        state = final_state(tmp_path / type(watch).__name__, [watch])
         assert equal(state, plain)
     assert watch.feed.broken
