@@ -31,7 +31,7 @@ EYE = np.array([3.2, -1.0, 1.9])  # [m] camera, from the middle of the robots
 class RerunView:
     """View of the robots of several slots in a Rerun stream."""
 
-    rate = 8.0  # [1/s] updates of the robots; each brings all poses since the last one
+    rate = 4.0  # [1/s] updates of the robots; each brings all poses since the last one
 
     def __init__(self, stream: Any, scene: RobotScene, names: Sequence[str], terms: Sequence[str]) -> None:
         """Log everything that does not change; stream: a `RecordingStream`; names: of the slots; terms: of rewards."""

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from threading import Thread
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -25,32 +25,14 @@ from jumper_warp.viz.rerun_server import RerunServer, announce
 SKIPPED = 2  # Policy steps from one shown pose to the next
 SPACING = 1.4  # [m] Distance between robots
 REACH = 1.2  # [m] Horizontal distance from its place at which a robot is held, so that it stays in view
-CURVES_EVERY, REWARDS_EVERY = (1.0, 0.25)  # [s] Time between two reads of the metrics files, and updates of the bars
-
-
-class View(Protocol):
-    """View of watched worlds, see `RerunView` for the arguments."""
-
-    rate: float
-
-    def show(self, times: np.ndarray, poses: np.ndarray, goals: np.ndarray) -> None:
-        """Show the robots."""
-
-    def show_rewards(self, when: float, sums: np.ndarray) -> None:
-        """Show stacked bars of the reward terms."""
-
-    def show_curves(self, lines: Sequence[dict[str, Any]], label: str = "") -> None:
-        """Append lines of a metrics file to the curves."""
-
-    def show_status(self, text: str) -> None:
-        """Show a text in Markdown."""
+CURVES_EVERY, REWARDS_EVERY = (2.0, 0.5)  # [s] Time between two reads of the metrics files, and updates of the bars
 
 
 class Show:
     """State of the viewer: players of all slots, metrics files, a view if there is one, and films."""
 
-    def __init__(self, setup: Setup, view: View | None) -> None:
-        """Prepare to show runs; view: None if only films are made."""
+    def __init__(self, setup: Setup, view: Any) -> None:
+        """Prepare to show runs; view: a `RerunView` or `ViserView`, or None to make films only."""
         self.setup = setup
         self._view = view
         shown = range(min(len(setup.folders), SHOWN_RUNS))
@@ -148,7 +130,7 @@ def main() -> None:
     single = len(setup.folders) == 1
     runs = setup.titles[:SHOWN_RUNS]
     names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]
-    view: View | None = None
+    view: Any = None
     with ExitStack() as cleanup:
         if setup.viewer != "none":
             view, url, page = open_view(setup, names, cleanup)
@@ -157,7 +139,7 @@ def main() -> None:
         run(Show(setup, view), source, 8.0 if view is None else view.rate)
 
 
-def open_view(setup: Setup, names: Sequence[str], cleanup: ExitStack) -> tuple[View, str, str]:
+def open_view(setup: Setup, names: Sequence[str], cleanup: ExitStack) -> tuple[Any, str, str]:
     """Return the view that a setup names, its address and that of a page in the browser; names: of the slots."""
     if setup.viewer == "viser":
         from jumper_warp.live.viser_view import ViserView
