@@ -51,6 +51,7 @@ class Page:
         self.visitors: dict[int, ClientHandle] = {}  # By id, in order of arrival; the first one drives
         self.speed = 1.0  # Simulated over real time
         self.paused = False
+        self.stopped = False  # Whether `run` ends
         self.steps = 0
         self.take: Take | None = None  # The recording under way
         self.status = server.gui.add_markdown("", order=-1.0)
@@ -116,7 +117,7 @@ class Page:
         dt = self.session.env.step_dt
         due = time.perf_counter()
         end = due + seconds
-        while due < end:
+        while due < end and not self.stopped:
             while not self.requests.empty():
                 self.requests.get()()
             if self.visitors and not self.paused:
@@ -139,6 +140,7 @@ class Page:
             if self.steps % REDRAW_EVERY == 0:
                 self.plots.redraw()
                 self.show_status()
+        self.server.flush()
         if self.take is not None and not self.take.add(self.session):
             self.finish_take()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -243,14 +244,14 @@ class Session:
         if jump.goal is not None and not jump.ready:
             ahead, *_ = trained_bounds(self.tasks[jump.skill])
             span = ahead.high - max(ahead.low, 0.0)
-            distance = float(np.hypot(*offset))
+            distance = float(np.linalg.norm(offset))
             nearest = max(ahead.low, 0.0) + 0.1 * span
             excess = distance - min(max(distance, nearest), nearest + 0.5 * span)
             bearing = float(np.arctan2(offset[1], offset[0]))
             if abs(bearing) > BEARING or abs(excess) > 0.0:
                 speed, turn = (
-                    float(np.sign(error) * np.clip(gain * abs(error), *bounds))
-                    for error, gain, bounds in ((excess, WALKING, SPEEDS), (bearing, TURNING, YAW_RATES))
+                    math.copysign(min(max(gain * abs(error), low), high), error) if error else 0.0
+                    for error, gain, (low, high) in ((excess, WALKING, SPEEDS), (bearing, TURNING, YAW_RATES))
                 )
                 return np.array([speed * (abs(bearing) < 0.5), 0.0, turn])
         jump.ready = True

@@ -6,17 +6,8 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.conditions import Conditions
+from drive_helpers import session_of
 from jumper_warp.evaluation.skills import SkillNames
-from jumper_warp.live.session import Session, load
-
-CPU = Conditions(device="cpu", threads=1)
-
-
-def session_of(*names, agent="policy", conditions=CPU):
-    """Return a session of policies, or of other sources for another agent."""
-    recipes, policies = zip(*(load(name, agent) for name in names), strict=True)
-    return Session(recipes, policies, conditions, agent=agent)
 
 
 @pytest.fixture(scope="module")
