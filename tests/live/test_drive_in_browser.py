@@ -43,7 +43,7 @@ def page(tmp_path_factory):
     server = open_server(0)
     page = Page(server, session, tmp_path_factory.mktemp("recordings"))
     server.scene.configure_default_lights(cast_shadow=False)  # for software rendering on few cores
-    thread = threading.Thread(target=page.run, args=(600.0,), daemon=True)
+    thread = threading.Thread(target=page.run, daemon=True)
     thread.start()
     yield page
     page.stopped = True
@@ -194,28 +194,6 @@ def test_another_visitor_has_no_controls_and_its_messages_are_ignored(page, driv
     wait_for(lambda: len(page.visitors) == 1)
 
 
-def test_recording_yields_a_page_a_rerun_file_and_a_film_that_play(page, driver, browser):
-    driver.keyboard.press("v")
-    wait_for(lambda: page.take is not None and page.take.frames > 20)
-    path = page.take.path
-    driver.keyboard.press("v")
-    wait_for(path.with_suffix(".mp4").exists, 120.0)
-    chunks = RrdReader(path.with_suffix(".rrd")).stream().to_chunks()
-    assert any("torque" in str(chunk.entity_path) for chunk in chunks)
-    player = browser.new_page(viewport={"width": 400, "height": 300}, device_scale_factor=0.25)
-    errors = []
-    player.on("pageerror", lambda error: errors.append(str(error)))
-    player.goto(f"file://{path}.html")
-    player.locator("canvas").first.wait_for()
-    import imageio.v3
-
-    frames = imageio.v3.imread(path.with_suffix(".mp4"), plugin="FFMPEG")
-    assert len(frames) >= 8
-    assert frames[0].std() > 10.0  # not one colour
-    assert not errors
-    player.close()
-
-
 def test_other_origins_and_tunnels_are_refused(page, driver):
     from viser._messages import ShareUrlRequest
 
@@ -234,3 +212,28 @@ def test_other_origins_and_tunnels_are_refused(page, driver):
 
 def test_console_has_no_errors(driver):
     assert driver.errors == []
+
+
+def test_recording_yields_a_page_a_rerun_file_and_a_film_that_play(page, driver, browser):
+    """The last test: it leaves the page."""
+    driver.keyboard.press("v")
+    wait_for(lambda: page.take is not None and page.take.frames > 20)
+    path = page.take.path
+    driver.keyboard.press("v")
+    wait_for(path.with_suffix(".html").exists)
+    driver.goto("about:blank")  # leaves the processor to the film
+    wait_for(path.with_suffix(".mp4").exists, 120.0)
+    chunks = RrdReader(path.with_suffix(".rrd")).stream().to_chunks()
+    assert any("torque" in str(chunk.entity_path) for chunk in chunks)
+    player = browser.new_page(viewport={"width": 400, "height": 300}, device_scale_factor=0.25)
+    errors = []
+    player.on("pageerror", lambda error: errors.append(str(error)))
+    player.goto(f"file://{path}.html")
+    player.locator("canvas").first.wait_for()
+    import imageio.v3
+
+    frames = imageio.v3.imread(path.with_suffix(".mp4"), plugin="FFMPEG")
+    assert len(frames) >= 8
+    assert frames[0].std() > 10.0  # not one colour
+    assert not errors
+    player.close()
