@@ -10,6 +10,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from jumper_warp.cli.completion import CompletionCfg, settings_of
+from jumper_warp.cli.drive import DriveCfg
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
 from jumper_warp.cli.export import ExportCfg
 from jumper_warp.cli.export_robot import ExportRobotCfg
@@ -29,6 +30,7 @@ from plain_text import to_markdown
 EXAMPLE_TASK = "vertical-jump"
 COMMON = {
     "finetune": ("num-goals", "height-range", "distance-range", "iterations", "out", "overwrite"),
+    "drive": ("agent", "solver", "ground", "port", "out", "friction", "latency", "gravity"),
     "play": ("seconds", "solver", "robot", "gravity", "video", "viewer", "out"),
     "evaluate": ("solver", "randomize", "noise", "seed", "robot", "gravity", "friction", "save-trials", "out"),
     "sysid fit": ("params", "mass", "torque-limit", "gain-preset", "out"),
@@ -50,6 +52,7 @@ def cli_page() -> str:
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
                  {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg)}),
+        section("drive POLICY ...", doc(DriveCfg), list_flags(DriveCfg)),
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
@@ -71,6 +74,7 @@ def summary() -> str:
     """Return the Markdown table of all commands and their purposes."""
     anchors = {
         "train": "train-task", "watch": "watch-run", "finetune": "finetune-policy", "play": "play-policy",
+        "drive": "drive-policy",
         "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
     }  # fmt: skip

@@ -32,7 +32,6 @@ class DriveCfg:
     ground: Literal["flat", "uneven", "waves", "slope", "stairs", "blocks"] = "flat"  # Ground at the start
     port: int = 8080  # Port of the page; the next free one is used if it is taken
     out: Path | None = None  # Folder for recordings (default: outputs/drive/<time>)
-    seconds: float | None = None  # [s] Time after which the command ends (default: none)
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -44,7 +43,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def drive(cfg: DriveCfg, modules: Sequence[ModuleType]) -> None:
-    """Serve the page until Ctrl-C or the end of `cfg.seconds`."""
+    """Serve the page until Ctrl-C."""
     from jumper_warp.live.page import Page
     from jumper_warp.live.session import Session, load
     from jumper_warp.utils.progress import phase
@@ -62,6 +61,6 @@ def drive(cfg: DriveCfg, modules: Sequence[ModuleType]) -> None:
     print(f"Drive at http://localhost:{port} (Ctrl-C ends).")
     print(f"From another machine: ssh -L {port}:localhost:{port} THIS_HOST, then open the same address.", flush=True)
     try:
-        page.run(float("inf") if cfg.seconds is None else cfg.seconds)
+        page.run()
     finally:
         server.stop()

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,6 @@ KEYS = {"i": (0, 1.0), "k": (0, -1.0), "u": (1, 1.0), "o": (1, -1.0), "j": (2, 1
 KEY_SPEEDS = np.array([0.6, 0.4, 0.8])  # [m/s], [m/s], [rad/s] Of a held key, and of a gamepad's full deflection
 KEY_LABEL = "Keys, gamepad"  # Label of the text field through which the page's script sends keys and gamepad
 HELP = "**I K** ahead, back · **J L** turn · **U O** sideways · **T** jump up · **click** jump there · **R** reset"
-SHORT_HELP = "**R** reset · **P** pause · **N** single step · **V** record · **B** push"
 PLOT_EVERY, REDRAW_EVERY = (3, 6)  # Policy steps between points of the plots, and between updates of one of them
 LATE = 0.1  # [s] Delay after which the clock restarts, instead of catching up
 
@@ -51,6 +50,7 @@ class Page:
         self.visitors: dict[int, ClientHandle] = {}  # By id, in order of arrival; the first one drives
         self.speed = 1.0  # Simulated over real time
         self.paused = False
+        self.stopped = False  # Whether `run` ends
         self.steps = 0
         self.take: Take | None = None  # The recording under way
         self.status = server.gui.add_markdown("", order=-1.0)
@@ -89,34 +89,17 @@ class Page:
         self.visitors.pop(visitor, None)
         if drove:
             self.session.velocity = np.zeros(3)
-            self.give_controls()
-
-    def hand_over(self) -> None:
-        """Give the controls to the next visitor, if there is one."""
-        if len(self.visitors) > 1:
-            driver = next(iter(self.visitors))
-            client = self.visitors.pop(driver)
-            client.gui.reset()
-            client.scene.remove_click_callback("all")
-            self.session.velocity = np.zeros(3)
-            self.give_controls()
-            self.enter(client)
-
-    def give_controls(self) -> None:
-        """Build the controls of the first visitor, if there is one."""
-        if self.visitors:
-            client = next(iter(self.visitors.values()))
-            client.gui.reset()
-            Controls(self, client)
+            for client in list(self.visitors.values())[:1]:
+                client.gui.reset()
+                Controls(self, client)
 
     # ------------------------------------------------------------------ loop
 
-    def run(self, seconds: float = np.inf) -> None:
-        """Simulate and show in real time for a duration [s]; nothing is simulated while there is no visitor."""
+    def run(self) -> None:
+        """Simulate and show in real time until `stopped`; nothing is simulated while there is no visitor."""
         dt = self.session.env.step_dt
         due = time.perf_counter()
-        end = due + seconds
-        while due < end:
+        while not self.stopped:
             while not self.requests.empty():
                 self.requests.get()()
             if self.visitors and not self.paused:
@@ -139,6 +122,7 @@ class Page:
             if self.steps % REDRAW_EVERY == 0:
                 self.plots.redraw()
                 self.show_status()
+        self.server.flush()
         if self.take is not None and not self.take.add(self.session):
             self.finish_take()
 
@@ -151,8 +135,7 @@ class Page:
         goal = None if session.jump is None else session.jump.goal
         if goal is not self.shown_goal:
             self.shown_goal = goal
-            height = 0.0 if goal is None else float(session.surface(goal[:1], goal[1:])[0])
-            self.scene.show_goals([] if goal is None else [np.append(goal, height)])
+            self.scene.show_goals([] if goal is None else [np.append(goal, session.surface(goal[:1], goal[1:]))])
 
     def show_status(self) -> None:
         """Show the active task, and a fall, a jump on its way or a recording."""
@@ -164,18 +147,13 @@ class Page:
         if (text := " · ".join(words)) != self.status.content:
             self.status.content = text
 
-    def start_take(self) -> None:
-        """Begin a recording."""
-        self.take = self.take or Take(self.server, self.session, self.model, self.folder)
-
     def finish_take(self) -> None:
         """End the recording, write its files in the background, and show their folder to all visitors."""
-        take = self.take
-        self.take = None
-        if take is not None:
-            take.finish(self.tell)
+        if self.take is not None:
+            self.take.finish(self.notify)
+            self.take = None
 
-    def tell(self, title: str, text: str) -> None:
+    def notify(self, title: str, text: str) -> None:
         """Show a notification to all visitors."""
         for client in list(self.visitors.values()):
             client.add_notification(title, text, auto_close_seconds=8.0)
@@ -190,11 +168,9 @@ class Controls:
         self.session = page.session
         self.gui = client.gui
         self.sliders = np.zeros(3)
-        self.height = 0.8  # [m] Commanded height of jumps up
-        self.gui.add_markdown(
-            HELP if len(page.session.tasks) > 1 else "**R** reset · **P** pause · **N** single step", order=0.0
-        )
-        self.status = self.gui.add_markdown("", order=1.0)
+        self.height = 0.0  # [m] Commanded height of jumps up
+        if len(page.session.tasks) > 1:
+            self.gui.add_markdown(HELP, order=0.0)
         tabs = self.gui.add_tab_group(order=2.0)
         with tabs.add_tab("Drive"):
             self._add_commands()
@@ -202,8 +178,8 @@ class Controls:
         with tabs.add_tab("Robot"):
             self._add_values()
             self._add_push()
-        self._add_keys()
-        self._add_shortcuts()
+        if "walk" in self.session.kinds():
+            self._add_keys()
         if "jump there" in self.session.kinds():
             client.scene.on_click()(lambda event: self.page.post(self._click, event.ray_origin, event.ray_direction))
 
@@ -217,10 +193,8 @@ class Controls:
                 slider.on_update(lambda event, i=bound.index: self.page.post(self._slide, i, event.target.value))
         if "jump up" in kinds:
             bound = trained_bounds(self.session.tasks[kinds["jump up"]])[0]
-            self.height = round(0.5 * (bound.low + bound.high), 2)
-            slider = self.gui.add_slider(
-                "jump height [m]", round(bound.low, 2), round(bound.high, 2), 0.01, self.height
-            )
+            low, self.height, high = np.round([bound.low, 0.5 * (bound.low + bound.high), bound.high], 2).tolist()
+            slider = self.gui.add_slider("jump height [m]", low, high, 0.01, self.height)
             slider.on_update(lambda event: setattr(self, "height", event.target.value))
             self._button("T jump up", self._jump_up)
         if not kinds:
@@ -230,16 +204,20 @@ class Controls:
         """Add a number for each value of the command of a task that neither walks nor jumps."""
         labels = self.session.tasks[0].command.labels or tuple(f"value {i + 1}" for i in range(4))
         numbers = [self.gui.add_number(label, float(label == "quaternion w [1]"), step=0.05) for label in labels]
-        self._button("Command", lambda: self.session.command_values([number.value for number in numbers]))
+        self._button("C command", lambda: self.session.env.command([number.value for number in numbers]))
 
     def _add_clock(self) -> None:
-        """Add controls of time, episode, ground and recording, and a button that hands the controls over."""
+        """Add controls of time, episode, ground and recording."""
         pace = self.gui.add_slider("speed [1]", 0.1, 1.0, 0.05, self.page.speed)
         pace.on_update(lambda event: setattr(self.page, "speed", event.target.value))
         ground = self.gui.add_dropdown("ground", GROUNDS, initial_value=self.session.ground)
         ground.on_update(lambda event: self.page.post(self._change_ground, event.target.value))
-        self._buttons("time", {"P pause": self._pause, "N step": self._single_step, "R reset": self.session.reset})
-        self._buttons("more", {"V record, stop": self._record, "Hand over": self.page.hand_over})
+        actions = {"P pause": self._pause, "N step": self._single_step, "R reset": self.session.reset}
+        buttons = self.gui.add_button_group("time", list(actions))
+        buttons.on_click(lambda event: self.page.post(actions[event.target.value]))
+        for label, action in actions.items():
+            self._shortcut(label, action)
+        self._button("V record, stop", self._record)
 
     def _add_values(self) -> None:
         """Add sliders of physical values, which act at once."""
@@ -253,35 +231,22 @@ class Controls:
         force = self.gui.add_slider("push [N]", 0.0, 200.0, 5.0, 60.0)
         direction = self.gui.add_slider("direction [deg]", -180.0, 180.0, 15.0, 90.0, hint="0: ahead, 90: to the left")
         self._button("B push", lambda: self.session.push(force.value, direction.value))
-        self.push = lambda: self.session.push(force.value, direction.value)
 
     def _add_keys(self) -> None:
         """Add the script that watches keys and gamepad, and the text field through which it reports them."""
-        if "walk" not in self.session.kinds():
-            return
         field = self.gui.add_text(KEY_LABEL, "", order=3.0)
         field.on_update(lambda event: self.page.post(self._hold, event.target.value))
         self.gui.add_html(f'<img style="display: none" src="data:," onerror="{html.escape(script())}">', order=4.0)
 
-    def _add_shortcuts(self) -> None:
-        """Add keyboard shortcuts of buttons, which viser's command palette (Ctrl+K) lists too."""
-        actions = {
-            "R": ("Reset", self.session.reset), "P": ("Pause", self._pause), "N": ("Single step", self._single_step),
-            "V": ("Record, stop", self._record), "B": ("Push", self.push),
-        }  # fmt: skip
-        if "jump up" in self.session.kinds():
-            actions["T"] = ("Jump up", self._jump_up)
-        for key, (label, action) in actions.items():
-            self.gui.add_command(label, hotkey=key).on_trigger(lambda event, act=action: self.page.post(act))  # pyright: ignore
-
-    def _buttons(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
-        """Add a row of buttons, each of which runs an action before the next step."""
-        group = self.gui.add_button_group(label, list(actions))
-        group.on_click(lambda event: self.page.post(actions[event.target.value]))
-
     def _button(self, label: str, action: Callable[[], object]) -> None:
-        """Add a button that runs an action before the next step."""
+        """Add a button that runs an action before the next step; a label `X words` has the shortcut X."""
         self.gui.add_button(label).on_click(lambda event: self.page.post(action))
+        self._shortcut(label, action)
+
+    def _shortcut(self, label: str, action: Callable[[], object]) -> None:
+        """Add the keyboard shortcut of a label `X words`, which viser's command palette (Ctrl+K) lists too."""
+        key: Any = label[0]
+        self.gui.add_command(label[2:], hotkey=key).on_trigger(lambda event: self.page.post(action))
 
     # ------------------------------------------------------------------ actions, in the thread of the loop
 
@@ -307,7 +272,7 @@ class Controls:
 
     def _click(self, origin: tuple[float, ...], direction: tuple[float, ...]) -> None:
         """Jump to the clicked point of the ground."""
-        goal = self.session.ground_point(*self.page.scene.world_ray(origin, direction))
+        goal = self.session.ground_point(np.array(origin) + self.page.scene.center, np.array(direction))
         if goal is not None:
             self.session.jump_to(goal)
 
@@ -322,10 +287,11 @@ class Controls:
         self.page.advance()
 
     def _record(self) -> None:
-        if self.page.take is None:
-            self.page.start_take()
+        page = self.page
+        if page.take is None:
+            page.take = Take(page.server, self.session, page.model, page.folder)
         else:
-            self.page.finish_take()
+            page.finish_take()
 
     def _change_ground(self, ground: str) -> None:
         self.page.finish_take()

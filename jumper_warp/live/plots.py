@@ -93,10 +93,9 @@ def series_of(labels: Iterable[str]) -> tuple[Any, ...]:
     series: list[Any] = []
     for label in labels:
         name, _, commanded = label.partition(", ")
-        color = CURVE_COLORS.get(name, CURVE_COLORS["FL"])
-        red, green, blue = (round(255 * part) for part in color)
-        series.append({"label": label, "stroke": f"rgb({red},{green},{blue})", "width": 1.5})
-        series[-1] |= {"dash": [5, 4]} if commanded or label == "commanded" else {}
+        rgb = ",".join(str(round(255 * part)) for part in CURVE_COLORS.get(name, CURVE_COLORS["FL"]))
+        dash = [5, 4] if commanded or label == "commanded" else []
+        series.append({"label": label, "stroke": f"rgb({rgb})", "width": 1.5, "dash": dash})
     return ({"label": "time [s]"}, *series[1:])
 
 
@@ -104,10 +103,8 @@ def bars_of(values: Mapping[str, float]) -> str:
     """Return bars of the active task's reward terms in the last step as HTML; values: of `Session.series`."""
     prefix = "reward of "
     terms = {name: value for name, value in values.items() if name.startswith(prefix) and np.isfinite(value)}
-    if not terms:
-        return ""
-    most = max(max(map(abs, terms.values())), 1.0e-9)
-    task = next(iter(terms)).removeprefix(prefix).partition("/")[0]
+    most = max([1.0e-9, *map(abs, terms.values())])
+    task = next(iter(terms), "").removeprefix(prefix).partition("/")[0]
     rows = [f"<b>{html.escape(task)}</b>, value of each term in this step"]
     for name, value in terms.items():
         label = html.escape(name.partition("/")[2].partition(" [")[0])

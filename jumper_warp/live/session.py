@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from newton import ModelFlags
+from scipy.ndimage import map_coordinates
 
 from jumper_warp.evaluation.conditions import Conditions, shared_robot
 from jumper_warp.evaluation.courses import NUDGE, NUDGE_AFTER, NUDGE_TIME, SQUAT_TIME
@@ -18,11 +21,13 @@ from jumper_warp.evaluation.velocities import SLEW_RATE, body_velocity
 from jumper_warp.kernels.jump.state import LANDED, JumpState
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.recipe import Recipe
+from jumper_warp.registry import task_names
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation
 from jumper_warp.tasks.switching import skills_and_handovers
+from jumper_warp.utils.files import read_json
 from jumper_warp.utils.kernels import records
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 
@@ -38,8 +43,7 @@ FALL_TIME = 1.5  # [s] Time from a fall to the reset
 TURNING, WALKING = (2.0, 1.5)  # [1/s] Gains of the approach to a goal: yaw rate over bearing, speed over distance
 SPEEDS, YAW_RATES = ((0.15, 0.5), (0.15, 1.0))  # [m/s], [rad/s] Smallest and largest of the approach
 BEARING = 0.06  # [rad] Largest bearing of a goal from which the robot jumps
-MAX_LATENCY = 40.0  # [ms] Largest latency that a driver can set
-MAX_VALUES = {"friction [1]": 1.5, "payload [kg]": 10.0, "gravity [m/s²]": 20.0, "latency [ms]": MAX_LATENCY}
+MAX_VALUES = {"friction [1]": 1.5, "payload [kg]": 10.0, "gravity [m/s²]": 20.0, "latency [ms]": 40.0}
 """Physical values that a driver can change while the robot moves, and their largest values."""
 Agent = Literal["policy", "hold", "random"]
 
@@ -205,10 +209,6 @@ class Session:
         else:
             self._begin_jump(np.append(goal, round(SQUAT_TIME / self.env.step_dt)))
 
-    def command_values(self, values: Sequence[float]) -> None:
-        """Set the command of a task of another kind, in the order of the labels of its `Command`."""
-        self.env.command(np.array(values, dtype=float))
-
     def push(self, force: float, direction: float) -> None:
         """Push the base for PUSH_TIME; force [N], direction [deg] in the horizontal plane, from the robot's heading."""
         angle = np.radians(direction) + self.yaw
@@ -243,14 +243,14 @@ class Session:
         if jump.goal is not None and not jump.ready:
             ahead, *_ = trained_bounds(self.tasks[jump.skill])
             span = ahead.high - max(ahead.low, 0.0)
-            distance = float(np.hypot(*offset))
+            distance = float(np.linalg.norm(offset))
             nearest = max(ahead.low, 0.0) + 0.1 * span
             excess = distance - min(max(distance, nearest), nearest + 0.5 * span)
             bearing = float(np.arctan2(offset[1], offset[0]))
             if abs(bearing) > BEARING or abs(excess) > 0.0:
                 speed, turn = (
-                    float(np.sign(error) * np.clip(gain * abs(error), *bounds))
-                    for error, gain, bounds in ((excess, WALKING, SPEEDS), (bearing, TURNING, YAW_RATES))
+                    math.copysign(min(max(gain * abs(error), low), high), error) if error else 0.0
+                    for error, gain, (low, high) in ((excess, WALKING, SPEEDS), (bearing, TURNING, YAW_RATES))
                 )
                 return np.array([speed * (abs(bearing) < 0.5), 0.0, turn])
         jump.ready = True
@@ -352,20 +352,15 @@ class Session:
             return np.zeros(len(x))
         field = self.field
         heights = field.min_z + np.asarray(field.data).reshape(field.nrow, field.ncol) * (field.max_z - field.min_z)
-        column = np.clip(np.round((x + field.hx) / (2.0 * field.hx) * (field.ncol - 1)), 0, field.ncol - 1).astype(int)
-        row = np.clip(np.round((y + field.hy) / (2.0 * field.hy) * (field.nrow - 1)), 0, field.nrow - 1).astype(int)
-        return heights[row, column]
+        row = (y + field.hy) / (2.0 * field.hy) * (field.nrow - 1)
+        column = (x + field.hx) / (2.0 * field.hx) * (field.ncol - 1)
+        return map_coordinates(heights, [row, column], order=1, mode="nearest")
 
     def ground_point(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
-        """Return the first point of the ground on a ray [m], (3,), world frame; None: the ray does not meet it."""
-        points = origin + np.arange(0.0, 30.0, 0.005)[:, None] * direction / np.linalg.norm(direction)
-        above = points[:, 2] - self.surface(points[:, 0], points[:, 1])
-        below = np.flatnonzero(above <= 0.0)
-        if not len(below):
-            return None
-        after = max(int(below[0]), 1)
-        weight = above[after - 1] / max(above[after - 1] - above[after], 1.0e-9)
-        return points[after - 1] + weight * (points[after] - points[after - 1])
+        """Return the first point of the ground on a ray [m], (3,), world frame, within 2 mm; None: there is none."""
+        points = origin + np.arange(0.0, 30.0, 0.002)[:, None] * direction / np.linalg.norm(direction)
+        below = np.flatnonzero(points[:, 2] <= self.surface(points[:, 0], points[:, 1]))
+        return points[below[0]] if len(below) else None
 
 
 def load(source: str, agent: Agent, modules: Sequence[ModuleType] = ()) -> tuple[Recipe, Policy | None]:
@@ -374,11 +369,7 @@ def load(source: str, agent: Agent, modules: Sequence[ModuleType] = ()) -> tuple
     source: as in `Policy.load`; for other agents also a task's name, or a JSON file with a recipe. modules: the user's.
     Raises InputError, PolicyError, TaskError or CheckpointError: it cannot be used.
     """
-    from pathlib import Path
-
     from jumper_warp.policies.policy import Policy
-    from jumper_warp.registry import task_names
-    from jumper_warp.utils.files import read_json
 
     if agent != "policy" and Path(source).suffix == ".json":
         return Recipe.from_json(read_json(Path(source), "recipe"), modules, complete=False), None

@@ -87,10 +87,6 @@ class ViserScene:
             for i, goal in enumerate(goals)
         ]
 
-    def world_ray(self, origin: Sequence[float], direction: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Convert a ray of a click in the viewer to the world frame; return its origin [m] and direction, (3,) each."""
-        return np.asarray(origin, dtype=float) + self.center, np.asarray(direction, dtype=float)
-
 
 def open_server(port: int) -> ViserServer:
     """Start a viser server on the loopback address and return it; port: the next free one is used if it is taken.
