@@ -25,7 +25,7 @@ from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange, chec
 from jumper_warp.sim.mujoco import MujocoDynamics
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_count, check_flags
+from jumper_warp.utils.checks import check_count, check_flags, check_type
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel
@@ -147,12 +147,9 @@ class Simulation(Uncopied):
         if solver not in ("jumper", "mujoco"):
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         check_flags(keep_momentum=keep_momentum, observe_forces=observe_forces, visuals=visuals)
-        if not isinstance(block, BlockCfg | None):
-            raise InputError(f"block must be a BlockCfg, got {block!r:.60}")
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
-        if not isinstance(robot, RobotOverlay | RobotValues | None):
-            raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
+        check_type("robot (see load_overlay)", robot, RobotOverlay | RobotValues | None)
         num_worlds = check_count("num_worlds", num_worlds)
         substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
