@@ -285,7 +285,16 @@ class Simulation(Uncopied):
 
         With delay [physics steps], (num_worlds,), they follow `previous` (12, num_worlds) until the target arrives.
         bodies: whether to write passive joints and bodies of the state. worlds: range to advance, by default all.
+        Raises InputError: substeps no whole number of at least 1, or arrays of another shape or type.
         """
+        substeps = check_count("substeps", substeps)
+        n = self.num_worlds
+        arrays = {"target": (target, (12, n)), "previous": (previous, (12, n)), "delay": (delay, (n,))}
+        for name, (array, shape) in arrays.items():
+            fits = isinstance(array, wp.array) and array.shape == shape
+            if not fits and (array is not None or name == "target"):
+                found = getattr(array, "shape", array)
+                raise InputError(f"{name} must be an array of shape {shape}, got {found!r:.60}")
         self.dynamics.follow(
             self.state, self.motors, target, self.dt, substeps, previous=previous, delay=delay, bodies=bodies,
             worlds=worlds,

@@ -224,6 +224,7 @@ class SolverJumper(SolverBase):
         """
         if state is None:
             raise InputError("update_contacts needs the state of the last step")
+        check_type("contacts", contacts, newton.Contacts)
         force = contacts.force
         if force is None:
             force = wp.zeros(contacts.rigid_contact_max, dtype=wp.spatial_vectorf, device=self.model.device)
@@ -237,7 +238,7 @@ class SolverJumper(SolverBase):
         dynamics = self.dynamics
         n = self.model.world_count
         device = self.model.device
-        self._check("state.body_q", state.body_q, self._state_shapes["body_q"])
+        self._check("state.body_q", getattr(state, "body_q", None), self._state_shapes["body_q"])
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
         if dynamics.ground_shape < 0:

@@ -95,6 +95,8 @@ class Recorder:
         Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         check_finite("time", time)
+        check_type("series", series, Mapping | None)
+        check_type("states", states, Mapping | None)
         if self._times and not time > self._times[-1]:
             raise InputError(f"time must increase, got {time} s after {self._times[-1]} s")
         poses = real_array(body_poses.numpy() if isinstance(body_poses, wp.array) else body_poses, "body_poses")

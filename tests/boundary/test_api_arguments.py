@@ -6,9 +6,11 @@ import dataclasses
 import math
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from jumper_warp import Env, Recipe, Simulation, SolverJumper, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
@@ -18,24 +20,31 @@ from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.sb3 import Sb3VecEnv
+from jumper_warp.evaluation.conditions import Conditions
+from jumper_warp.identification.motions import load_motions
 from jumper_warp.policies.catalog import ONNX, add_files
 from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
-from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.robot.motors import jumping_motors, walking_motors
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.terrain import TerrainCfg
 from jumper_warp.tasks.terms import StateMetric
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.viz.film import check_film, write_film
+from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.recorder import Recorder
 from jumper_warp.viz.recording import load_npz
+from jumper_warp.viz.rerun import write_rrd
 
 POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
 HEIGHT = make_task("vertical-jump").observations.actor[0]
+COMMAND = make_task("vertical-jump").command
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +55,10 @@ def env():
 @pytest.fixture(scope="module")
 def model():
     return build_model(1)
+
+
+def contacts_of(model):
+    return newton.CollisionPipeline(model).contacts()
 
 
 @pytest.mark.parametrize("other", [None, 3, "x", object(), ZEROS])
@@ -156,6 +169,31 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: Recorder(model).record("x", model.body_q), "time"),
         (lambda env, model: Recorder(model).record(math.nan, model.body_q), "time"),
         (lambda env, model: Recorder(model).record(0.0, None), "body_poses"),
+        (lambda env, model: Recorder(model).record(0.0, model.body_q, "x"), "series"),
+        (lambda env, model: Recorder(model).record(0.0, model.body_q, states="x"), "states"),
+        (lambda env, model: env.sim.advance(None, env.sim.target), "substeps"),
+        (lambda env, model: env.sim.advance(-1, env.sim.target), "substeps"),
+        (lambda env, model: env.sim.advance(1, None), "target"),
+        (lambda env, model: env.sim.advance(1, wp.zeros((12, 2), dtype=float, device="cpu")), "target"),
+        (lambda env, model: env.sim.advance(1, env.sim.target, delay=3), "delay"),
+        (lambda env, model: SolverJumper(model).update_contacts(None, model.state()), "contacts"),
+        (lambda env, model: SolverJumper(model).update_contacts(contacts_of(model), "x"), "state"),
+        (lambda env, model: save_policy(Path("none"), "vertical_jump"), "policy"),
+        (lambda env, model: jumping_motors("x"), "torque"),
+        (lambda env, model: jumping_motors(lateral_torque="x"), "torque"),
+        (lambda env, model: walking_motors(None), "torque"),
+        (lambda env, model: Conditions(latency="x"), "latency"),
+        (lambda env, model: Conditions(gain_scale=1.0), "gain_scale"),
+        (lambda env, model: Conditions(sensor_offset="x"), "sensor_offset"),
+        (lambda env, model: dataclasses.replace(COMMAND, labels=3), "labels"),
+        (lambda env, model: dataclasses.replace(COMMAND, least=0.0), "least"),
+        (lambda env, model: dataclasses.replace(COMMAND, optional="x"), "optional"),
+        (lambda env, model: write_film("x", Path("x.gif")), "recording"),
+        (lambda env, model: write_picture("x", Path("x.png")), "recording"),
+        (lambda env, model: write_rrd("x", Path("x.rrd")), "recording"),
+        (lambda env, model: check_film(Path("x.gif"), 3, 10.0, 1.0), "size"),
+        (lambda env, model: check_film(Path("x.gif"), (64, 64), "x", 1.0), "fps"),
+        (lambda env, model: check_film(Path("x.gif"), (64, 64), 10.0, None), "speed"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, commands=ZEROS), "commands"),
     ],
 )  # fmt: skip
@@ -295,6 +333,16 @@ def test_a_task_is_registered_by_names_and_a_function(arguments):
 def test_switches_are_bools(call):
     with pytest.raises(InputError, match="must be True or False"):
         call()
+
+
+def test_paths_are_texts_too(tmp_path: Path, model):
+    recorder = Recorder(model)
+    recorder.record(0.0, model.body_q)
+    assert write_rrd(recorder.recording(), str(tmp_path / "a.rrd")).is_file()
+    with pytest.raises(InputError, match="no npz, csv or parquet file"):
+        load_motions([str(tmp_path)])
+    folder = output_dir("results", str(tmp_path / "out"))
+    assert write_metrics(str(folder), {"height_m": 0.5}).path.is_file()
 
 
 def test_a_recording_without_series_is_written(tmp_path: Path):
