@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import socket
 import time
 from pathlib import Path
@@ -21,25 +22,23 @@ class EventsFile:
 
         config: JSON-ready configuration of the run. Raises OSError: the file cannot be created.
         """
-        from tensorboard.compat.proto.event_pb2 import SessionLog
         from tensorboard.summary.writer.record_writer import RecordWriter
         from torch.utils.tensorboard.summary import hparams
 
+        self._proto: Any = importlib.import_module("tensorboard.compat.proto.event_pb2")
         name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{time.time_ns()}"
         self._records = RecordWriter((folder / name).open("xb", buffering=BUFFER))
         self._write(file_version="brain.Event:2")
         if iteration:
-            self._write(step=iteration + 1, session_log=SessionLog(status=SessionLog.START))
+            self._write(step=iteration + 1, session_log={"status": self._proto.SessionLog.START})
         settings = {key: value for key, value in flat_settings(config).items() if isinstance(value, bool | int | float)}
         for summary in hparams(settings, {"Metrics/success": 0.0}):
             self._write(summary=summary)
 
     def add(self, iteration: int, metrics: dict[str, float]) -> None:
         """Write the metrics of an iteration by name. Raises OSError, such as on a full disk."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        values = [Summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
-        self._write(step=iteration, summary=Summary(value=values))
+        values = [{"tag": name, "simple_value": value} for name, value in metrics.items()]
+        self._write(step=iteration, summary={"value": values})
         self._records.flush()
 
     def close(self) -> None:
@@ -48,6 +47,4 @@ class EventsFile:
 
     def _write(self, **fields: Any) -> None:
         """Write an event to the buffer; fields: those of TensorBoard's `Event`."""
-        from tensorboard.compat.proto.event_pb2 import Event
-
-        self._records.write(Event(wall_time=time.time(), **fields).SerializeToString())
+        self._records.write(self._proto.Event(wall_time=time.time(), **fields).SerializeToString())
