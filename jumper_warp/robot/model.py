@@ -114,7 +114,12 @@ def build_model(
 
 
 def _write_values(model: Model, robots: RobotValues) -> None:
-    """Replace masses, joint constants and paw friction of a model of the description by those of given robots."""
+    """Give a model of the description the masses, joint constants and paw friction of given robots.
+
+    Newton's bodies of a world are the base, then the links of each leg in the order of LINK_KINDS. `base_mass` [kg] and
+    `base_com` [m] replace the base's values; `link_mass` (worlds, kinds of links) and `base_inertia` are factors. The
+    inertia of a body grows with its mass, that of the base by `base_inertia` besides.
+    """
     n = model.world_count
     mass = model.body_mass.numpy().reshape(n, -1)
     com = model.body_com.numpy().reshape(n, -1, 3)
@@ -161,7 +166,7 @@ def other_colliders(model: Model) -> np.ndarray:
 def leg_geometry(description: RobotDescription) -> list[dict]:
     """Return the lengths that define each leg's geometry, one dict per leg in FL, FR, BL, BR order.
 
-    By the names of the fields of the kernels' `LegGeometry`.
+    The keys are the names of the fields of the kernels' `LegGeometry`.
     """
     return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
 
