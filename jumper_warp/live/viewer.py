@@ -25,7 +25,7 @@ from jumper_warp.viz.rerun_server import RerunServer, announce
 SKIPPED = 2  # Policy steps from one shown pose to the next
 SPACING = 1.4  # [m] Distance between robots
 REACH = 1.2  # [m] Horizontal distance from its place at which a robot is held, so that it stays in view
-CURVES_EVERY, REWARDS_EVERY = (2.0, 0.5)  # [s] Time between two reads of the metrics files, and updates of the bars
+CURVES_EVERY, REWARDS_EVERY = (2.0, 1.0)  # [s] Time between two reads of the metrics files, and updates of the bars
 
 
 class Show:
