@@ -240,8 +240,9 @@ def step_commands(rng: np.random.Generator, robots: int, reach: float, step: flo
 def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     """Return the time [s] from the last command until the planar velocity stays within SETTLED of it, (robots,).
 
-    Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles, or falls.
-    hold [s]: time for which the velocity must stay; None: to the end, so that later pushes count too.
+    Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles.
+    hold [s]: time for which the velocity must stay; a robot that falls after it has settled. None: to the end, so that
+    later pushes and falls count too: the velocity (steps, robots, 3) of a fallen robot is NaN.
     """
     window = round(SMOOTHING / walks.step_dt)
     first = round(walks.times[-1] / walks.step_dt)

@@ -83,10 +83,11 @@ class Recipe:
         env: Json = {name: getattr(self, name) for name in ("randomize", "noise")}
         env |= {"task": task_to_json(self.task), "solver": next(k for k, v in SOLVERS.items() if v == self.solver)}
         env |= {} if self.robot is None else {"robot": self.robot.to_json()}
+        # as read from a file, so that recipes can be compared: paths become texts, tuples become lists
         return {"train": json.loads(json.dumps(dataclasses.asdict(self.train), default=str)), "env": env}
 
     def check_saving(self) -> None:
-        """Raise InputError unless the task, saved as JSON and read back, is unchanged.
+        """Raise TaskError unless the task, saved as JSON and read back, is unchanged.
 
         It is called before a training, whose checkpoints would otherwise stand for another task.
         """
@@ -121,8 +122,8 @@ def _imported() -> list[ModuleType]:
 def _restored(saved: Any, modules: list[ModuleType], complete: bool) -> tuple[TaskCfg, str]:
     """Return the task in JSON data, and the reason why it lacks its events; arguments: see `Recipe.from_json`.
 
-    Functions of a user's task may be missing. Unless it must be `complete`, rewards and critic may be left out, which a
-    trained policy does not need, and then all sections in OPTIONAL.
+    Functions of a user's task may be missing. Unless it must be `complete`, rewards and critic may then be left out: a
+    trained policy does not need them. If that is not enough, all sections in OPTIONAL are left out.
     """
     try:
         return task_from_json(saved, modules), ""

@@ -30,7 +30,7 @@ from jumper_warp.robot.motors import (
 from jumper_warp.sim.dynamics import JumperDynamics, WorldRange, check_step, slices_of
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_flags, check_within
+from jumper_warp.utils.checks import check_count, check_flags, check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
@@ -119,9 +119,9 @@ class Rollout(Uncopied):
     ):
         check_flags(double=double)
         substeps = check_step(dt, substeps)
-        every = substeps if every is None else every
-        if every not in range(1, substeps + 1) or substeps % every != 0:
-            raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
+        every = substeps if every is None else check_count("every", every, substeps)
+        if substeps % every != 0:
+            raise InputError(f"every must be a divisor of substeps = {substeps}, got {every}")
         if tolerance is None:
             tolerance = TOLERANCE_DOUBLE if double else TOLERANCE
         self.dynamics = JumperDynamics(
@@ -241,7 +241,8 @@ class Rollout(Uncopied):
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
             impulse: Contact impulses of the previous physics step, as in `Trajectory.impulse`, (4, num_worlds) vec3; by
-                default zero. They start the contact iteration; loaded paws that hardly slip have static friction.
+                default zero. They are the first guess of the contact iteration. A loaded paw that hardly slips has
+                static friction.
 
         Raises:
             InputError: an array of another shape or type, NumPy values that are not finite, or, on a CPU, a latency
@@ -341,7 +342,8 @@ class Rollout(Uncopied):
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> KernelStruct:
         """Collect the loss gradients w.r.t. the arrays of a trajectory in a struct, the input of the reverse kernels.
 
-        Empty for None and filtered_target. Raises InputError: another shape or type than the trajectory's array.
+        Empty for None, and for the flags `pressed`, which have no gradient. That of filtered_target is only checked, as
+        the reverse pass begins with `target`. Raises InputError: another shape or type than the trajectory's array.
         """
         cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in by_outputs.items():

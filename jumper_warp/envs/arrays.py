@@ -62,7 +62,8 @@ def robot_arrays(sim: Simulation, step_dt: float) -> KernelStruct:
 def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: wp.DeviceLike) -> KernelStruct:
     """Return new arrays of every world's episode state (`EpisodeArrays`), ready for the first reset.
 
-    skill: (num_envs,) index of each world's task.
+    seed, stream: random seed, and the purpose whose random numbers it selects; skill: (num_envs,) index of each world's
+    task. A requested task or termination of -1 means none.
     """
     episode = EpisodeArrays()
     episode.seed = seed
@@ -181,7 +182,8 @@ def checked_commands(commands: object, mask: np.ndarray, tasks: Sequence[TaskCfg
     """Check that commands are valid for a task, and return them as float32 (num_envs, 4), padded with zeros.
 
     mask: (num_envs,), nonzero for worlds to command.
-    commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
+    commands: one row, or one per world, valid for at least one task: which one a world has is known only on the
+    device. Raises InputError: they are valid for none.
     """
     array = real_array(commands, "commands")
     n = len(mask)

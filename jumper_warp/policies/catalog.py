@@ -152,10 +152,11 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
     if not isinstance(saved, dict) or not isinstance(updating, dict):
         raise PolicyError(f"{path}: has no table of checksums")
     files = {}
-    for name in {CONFIG: "", ONNX: "", **saved, **updating}:
+    for name in dict.fromkeys((CONFIG, ONNX, *saved, *updating)):
         if not FILE_NAME.fullmatch(name):
             raise PolicyError(f"{path}: names a file {name!r:.60}")
-        if (name.endswith(PICTURES) or name not in saved) and not os.path.lexists(folder / name):
+        may_lack = name.endswith(PICTURES) or name not in (CONFIG, ONNX, *saved)  # not yet written by the update
+        if may_lack and not os.path.lexists(folder / name):
             continue
         files[name] = read_file(folder / name, PURPOSE, error=PolicyError)
         if hashlib.sha256(files[name]).hexdigest() not in (saved.get(name), updating.get(name)):

@@ -114,9 +114,10 @@ class FlatAdam:
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
     """Return the learning rate (), lowered if the KL divergence of the policy update is too large, raised if too small.
 
-    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A smaller kl
-    than 1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within
-    cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0. PPO assumes small updates; a rate that holds the KL
+    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A kl below
+    1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within
+    cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0. desired_kl: the present target, which moves from
+    cfg.desired_kl to cfg.final_desired_kl. PPO assumes small updates; a rate that holds the KL
     divergence near desired_kl makes them as large as that allows.
     """
     if cfg.desired_kl <= 0.0:

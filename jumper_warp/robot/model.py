@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from numbers import Real
 from types import ModuleType
 from typing import Any, cast
 
@@ -24,7 +23,7 @@ from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.legs import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.utils.checks import check_count, check_flags
+from jumper_warp.utils.checks import check_count, check_flags, check_number, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.runtime import init_warp
@@ -91,13 +90,15 @@ def build_model(
 
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
-            unknown `ground`.
+            unknown `ground`; or an argument of another type.
     """
     num_worlds = check_count("num_worlds", num_worlds)
     check_flags(visuals=visuals, mujoco=mujoco)
-    if not isinstance(friction, Real) or not 0.0 <= friction <= MAX_FRICTION:
-        raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction!r:.40}")
+    check_number("friction", friction, 0.0, MAX_FRICTION)
     check_gravity(gravity)
+    check_type("description", description, RobotDescription | None)
+    check_type("extras", extras, Callable | None)
+    check_type("robot", robot, RobotValues | None)
     init_warp()
     description = load_description() if description is None else description
     builder = _empty_builder(gravity, mujoco)
@@ -113,7 +114,12 @@ def build_model(
 
 
 def _write_values(model: Model, robots: RobotValues) -> None:
-    """Replace masses, joint constants and paw friction of a model of the description by those of given robots."""
+    """Give a model of the description the masses, joint constants and paw friction of given robots.
+
+    Newton's bodies of a world are the base, then the links of each leg in the order of LINK_KINDS. `base_mass` [kg] and
+    `base_com` [m] replace the base's values; `link_mass` (worlds, kinds of links) and `base_inertia` are factors. The
+    inertia of a body grows with its mass, that of the base by `base_inertia` besides.
+    """
     n = model.world_count
     mass = model.body_mass.numpy().reshape(n, -1)
     com = model.body_com.numpy().reshape(n, -1, 3)
@@ -160,7 +166,7 @@ def other_colliders(model: Model) -> np.ndarray:
 def leg_geometry(description: RobotDescription) -> list[dict]:
     """Return the lengths that define each leg's geometry, one dict per leg in FL, FR, BL, BR order.
 
-    By the names of the fields of the kernels' `LegGeometry`.
+    The keys are the names of the fields of the kernels' `LegGeometry`.
     """
     return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
 

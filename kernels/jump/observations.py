@@ -3,7 +3,8 @@
 Horizontal vectors are in heading axes (ahead, to the left), so that a jump looks the same in every direction. World z
 is up. `state.goal` is (x, y of the landing, base height at the apex), world. A critic with more information, such as
 the jump's phase, learns faster. `set_mirror` states how a term changes if the robot is mirrored left to right: column
-numbers, negative where the sign changes. `SIGHT_RANGE` is clamped to, so that the network's input stays bounded.
+numbers, negative where the sign changes. Distances to a block are clamped to +-`SIGHT_RANGE`. So
+the network's input stays bounded.
 """
 
 import warp as wp
@@ -109,8 +110,9 @@ def span_of_ray(offset: float, half: float, direction: float) -> wp.vec2:
 
 @wp.func
 def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -> wp.vec2:
-    """Return the distances [m] at which a ray from (from_x, from_y) [m] at `heading` [rad] enters and leaves a block.
+    """Return the distances [m] at which a line from (from_x, from_y) [m] at `heading` [rad] enters and leaves a block.
 
+    Negative distances are behind the point.
     Both are clamped to +-SIGHT_RANGE, and are SIGHT_RANGE if the ray misses the block or there is none.
     """
     along_x = span_of_ray(float(block.center[0]) - from_x, float(block.half[0]), wp.cos(heading))
@@ -119,7 +121,7 @@ def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -
     leave = wp.min(along_x[1], along_y[1])
     if block.exists == 0 or enter >= leave or enter > SIGHT_RANGE:
         return wp.vec2(SIGHT_RANGE, SIGHT_RANGE)
-    return wp.vec2(wp.max(enter, -SIGHT_RANGE), wp.min(leave, SIGHT_RANGE))
+    return wp.vec2(wp.max(enter, -SIGHT_RANGE), wp.clamp(leave, -SIGHT_RANGE, SIGHT_RANGE))
 
 
 @wp.func

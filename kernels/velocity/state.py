@@ -84,7 +84,8 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
     """Return the state of velocity tracking (errors, step counts, gait phase) updated by one policy step.
 
     Errors count only when more than `settle` policy steps have passed since the command: a robot needs time to change
-    its speed. `score` compares policies during training; it grows with commanded speed and terrain level.
+    its speed. `score` compares policies during training. It grows with commanded speed and terrain level, so that a
+    policy on an easy level is not taken for a better one.
     """
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1

@@ -213,6 +213,13 @@ def reshape_block(model):
     bias.dims.extend([1, 1])
 
 
+def remove_files(folder):
+    """Remove network and configuration of a policy, and their checksums."""
+    edit_manifest(lambda manifest: manifest.update(sha256={}))(folder)
+    for name in ("config.json", "policy.onnx"):
+        (folder / name).unlink()
+
+
 NOT_UTF8 = b"\x3a\x06\x2a\x04\x42\x02\xff\xfe"  # Model with a graph (7) with an initialiser (5) with a name (8)
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 REFUSALS = {
@@ -221,6 +228,7 @@ REFUSALS = {
         edit_manifest(lambda m: m.update(schema_version=2)),
         "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
+    "neither files nor checksums": (remove_files, "config.json: no such file"),
     "no checksums": (edit_manifest(lambda m: m.update(sha256=3)), "has no table of checksums"),
     "file of another folder": (edit_manifest(lambda m: m["sha256"].update({"../x": "0"})), "names a file '../x'"),
     "weights in another file": (

@@ -7,7 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from columns import ANG_VEL, LIN_VEL, MOTOR_COORDS, POS, QUAT, X, Y, Z
 from jump_helpers import DEG, Robots, edit_episodes, make_env, make_episode, only, without_draws
+from jumper_warp.kernels.jump.observations import edges_of_block
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
+from jumper_warp.kernels.scalar import vec2
+from jumper_warp.kernels.terrain.ground import Block
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.mirror import mirror_of
 from mdp_helpers import array
@@ -256,6 +259,23 @@ def test_block_ahead_matches_sampling_along_three_rays():
     ahead = exists & (observed[:, 2] > 0.0) & (observed[:, 2] < 2.0)
     under = exists & (observed[:, 2] < 0.0)
     assert ahead.sum() > 20 and under.sum() > 20
+
+
+@wp.kernel
+def edges_kernel(centers: wp.array(dtype=float), edges: wp.array(dtype=wp.vec2)):
+    """Write the distances along x from the origin to blocks of 0.6 m with these centres [m] on the x axis."""
+    i = wp.tid()
+    block = Block()
+    block.exists = 1
+    block.center = vec2(centers[i], 0.0)
+    block.half = vec2(0.3, 0.3)
+    edges[i] = edges_of_block(block, 0.0, 0.0, 0.0)
+
+
+def test_distances_to_a_block_stay_within_sight():
+    edges = wp.zeros(3, dtype=wp.vec2, device="cpu")
+    wp.launch(edges_kernel, 3, [array([-4.0, -2.1, 1.9]), edges], device="cpu")
+    np.testing.assert_allclose(edges.numpy(), [(-2.0, -2.0), (-2.0, -1.8), (1.6, 2.0)], atol=1e-6)
 
 
 def test_block_ahead_is_2_m_for_all_rays_without_a_block():
