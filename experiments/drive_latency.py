@@ -26,7 +26,7 @@ from jumper_warp.live.page import KEY_LABEL
 from jumper_warp.utils.output import output_dir
 from support.scripts import OutputArgs, report, run_script
 
-MOVED = 1.0e-3  # [m] Displacement of the base that counts as motion
+MOVED = 1.0e-4  # [m] Displacement of the base that counts as motion
 REST = 2.0  # [s] Time between two presses
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [1, 1, 1], "fov": 1.0, "near": 0.1, "far": 100.0,
@@ -119,7 +119,7 @@ async def measure(port: str, process: int, presses: int) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Start `jumper drive`, measure it, and end it."""
-    command = [sys.executable, "-m", "jumper_warp", "drive", "--device", "cpu", "--threads", "1", "--port", "8300"]
+    command = [sys.executable, "-m", "jumper_warp", "drive", "--device", "cpu", "--port", "8300"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         found = None

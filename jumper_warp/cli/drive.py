@@ -51,7 +51,7 @@ def drive(cfg: DriveCfg, modules: Sequence[ModuleType]) -> None:
     from jumper_warp.viz.viser import open_server
 
     server = open_server(cfg.port)
-    configure_device(cfg.conditions.device, cfg.conditions.threads)
+    configure_device(cfg.conditions.device, cfg.conditions.threads or 1)  # small networks are slower on several threads
     with phase("building the robot"):
         loaded = [load(source, cfg.agent, modules) for source in cfg.policies]
         recipes, policies = zip(*loaded, strict=True)

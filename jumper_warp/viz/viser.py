@@ -63,9 +63,11 @@ class ViserScene:
 
     def update(self, poses: np.ndarray) -> None:
         """Place all robots; poses: (robots, links, 7), position [m] and quaternion xyzw, world frame."""
+        by_link = np.moveaxis(poses, 1, 0).astype(np.float32)
+        quaternions = np.roll(by_link[..., 3:], 1, axis=2)
         for body, link in self.links.items():
-            link.batched_positions = poses[:, body, :3].astype(np.float32)
-            link.batched_wxyzs = np.roll(poses[:, body, 3:], 1, axis=1).astype(np.float32)
+            link.batched_positions = by_link[body, :, :3]
+            link.batched_wxyzs = quaternions[body]
 
     def follow(self, point: np.ndarray) -> None:
         """Move the viewer's origin to a point [m], (3,), world frame."""
