@@ -9,6 +9,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from jumper_warp.cli.compare import CompareCfg
 from jumper_warp.cli.completion import CompletionCfg, settings_of
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
 from jumper_warp.cli.export import ExportCfg
@@ -31,6 +32,7 @@ COMMON = {
     "finetune": ("num-goals", "height-range", "distance-range", "iterations", "out", "overwrite"),
     "play": ("seconds", "solver", "robot", "gravity", "video", "viewer", "out"),
     "evaluate": ("solver", "randomize", "noise", "seed", "robot", "gravity", "friction", "save-trials", "out"),
+    "compare": ("file", "primary", "metric", "evaluate", "html", "out"),
     "sysid fit": ("params", "mass", "torque-limit", "gain-preset", "out"),
     "sysid excite": ("params", "seconds", "robot", "seed", "out"),
 }
@@ -52,6 +54,7 @@ def cli_page() -> str:
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
+        section("compare A B ...", doc(CompareCfg), list_flags(CompareCfg)),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
@@ -71,6 +74,7 @@ def summary() -> str:
     anchors = {
         "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
+        "compare": "compare-a-b",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()
@@ -91,7 +95,7 @@ def section(
     command: with its positional arguments. headings: names of the common flags by heading. more: further flags, each
     list in a collapsed block of its own.
     """
-    name = command.split(" POLICY")[0].split(" DATA")[0]
+    name = command.split(" POLICY")[0].split(" DATA")[0].split(" A B")[0]
     by_name = {flag.name: flag for flag in flags}
     if headings is None and name in COMMON:
         headings = {"Common flags": COMMON[name]}

@@ -61,7 +61,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     tasks = task_names()
     policies = tuple(policy_tasks())
-    names: dict[str, Iterable[str]] = dict.fromkeys(("play", "evaluate", "finetune", "export"), policies)
+    names: dict[str, Iterable[str]] = dict.fromkeys(("play", "evaluate", "finetune", "compare", "export"), policies)
     names |= {"train": tasks, "info": (*tasks, *policies), "sysid": ("fit", "excite", "actuator")}
     names["completion"] = ("bash", "zsh")
     flags = {command: [flag for cfg in settings_of(command) for flag in list_flags(cfg)] for command in COMMANDS}
@@ -79,7 +79,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import doctor, export, info, list, sysid, train
+    from jumper_warp.cli import compare, doctor, export, info, list, sysid, train
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
@@ -90,6 +90,7 @@ def settings_of(command: str) -> list[Any]:
         "finetune": [FinetuneArgs],
         "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
         "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
+        "compare": [compare.CompareCfg],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
         "list": [list.ListCfg],

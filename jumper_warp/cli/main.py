@@ -33,6 +33,7 @@ COMMANDS = {
     "finetune": "Reduce a jumping policy's errors by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
+    "compare": "Compare trainings of several seeds: jumper compare A B.",
     "export": "Save a policy, or the robot for other simulators.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
