@@ -79,7 +79,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import compare, doctor, export, info, list, sysid, train
+    from jumper_warp.cli import compare, doctor, export, info, list, rescore, sysid, train
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
@@ -91,6 +91,7 @@ def settings_of(command: str) -> list[Any]:
         "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
         "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
         "compare": [compare.CompareCfg],
+        "rescore": [rescore.RescoreCfg],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
         "list": [list.ListCfg],

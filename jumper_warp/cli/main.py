@@ -34,6 +34,7 @@ COMMANDS = {
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
     "compare": "Compare trainings of several seeds: jumper compare A B.",
+    "rescore": "Evaluate changed rewards on a recorded motion.",
     "export": "Save a policy, or the robot for other simulators.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
