@@ -22,6 +22,8 @@ from jumper_warp.cli.rescore import RescoreCfg
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.cli.try_task import TryCfg
+from jumper_warp.evaluation.agents import AgentCfg
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
 from jumper_warp.evaluation.suites import SUITES
@@ -51,11 +53,13 @@ def cli_page() -> str:
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
-                 {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg)}),
+                 {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg),
+                  "Flags with --agent": list_flags(AgentCfg)}),
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
         section("compare A B ...", doc(CompareCfg), list_flags(CompareCfg)),
+        section("try FILE", doc(TryCfg), list_flags(TryCfg)),
         section("rescore RECORDING", doc(RescoreCfg), list_flags(RescoreCfg)),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
@@ -76,7 +80,7 @@ def summary() -> str:
     anchors = {
         "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
-        "compare": "compare-a-b", "rescore": "rescore-recording",
+        "compare": "compare-a-b", "rescore": "rescore-recording", "try": "try-file",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()

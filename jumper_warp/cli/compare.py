@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +15,9 @@ import tyro
 
 from jumper_warp.cli.main import UsageError, parse
 from jumper_warp.evaluation.conditions import Conditions
+from jumper_warp.registry import load_task_module
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json, read_file
 
 
 @dataclass(frozen=True)
@@ -41,15 +47,50 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     Raises InputError or OSError: a source, setting or file is invalid.
     """
     cfg: CompareCfg = parse(CompareCfg, "compare", args)
-    if cfg.file is None and len(cfg.sources) == 0:
+    if (cfg.file is None) == (len(cfg.sources) == 0):
         raise UsageError("name what to compare: jumper compare A B, or jumper compare --file FILE.toml")
+    settings = {}
+    sources = cfg.sources
+    if cfg.file is not None:
+        settings = read_toml(cfg.file)
+        modules = [*modules, *(load_task_module(str(cfg.file.parent / name)) for name in settings.get("modules", ()))]
+        sources = train_file(settings)
     from jumper_warp.compare.comparison import compare
     from jumper_warp.compare.report import lines, write_report
     from jumper_warp.utils.output import output_dir
 
+    primary = cfg.primary or settings.get("primary", "")
+    conditions = dataclasses.replace(cfg.conditions, **settings.get("conditions", {}))
     comparison = compare(
-        *cfg.sources, metric=cfg.metric, primary=cfg.primary, evaluate=cfg.evaluate, conditions=cfg.conditions,
-        modules=modules,
+        *sources, metric=cfg.metric, primary=primary, evaluate=cfg.evaluate, conditions=conditions, modules=modules,
+        evaluation=with_tuples(settings.get("evaluation", {})), title=settings.get("title", "Comparison"),
     )  # fmt: skip
     print("\n".join(lines(comparison)))
     print(write_report(comparison, output_dir("compare", cfg.out), html=cfg.html))
+
+
+def train_file(settings: Json) -> list[str]:
+    """Train the arms of a settings file that are not finished, and return them as sources NAME=RUN."""
+    from jumper_warp.cli.train import parse_train
+    from jumper_warp.compare.training import train_arm
+
+    common = [*shlex.split(settings.get("flags", "")), "--seeds", *map(str, settings["seeds"])]
+    common += ["--log-root", settings.get("log_root", "logs"), "--no-tensorboard"]
+    recipes = {}
+    for name, arm in settings["arms"].items():
+        task, flags = (settings["task"], arm) if isinstance(arm, str) else (arm["task"], arm.get("flags", ""))
+        recipes[name] = parse_train([task, *common, *shlex.split(flags), "--run-name", name])[0]
+    return [f"{name}={train_arm(recipe)}" for name, recipe in recipes.items()]
+
+
+def read_toml(path: Path) -> Json:
+    """Return the content of a TOML file. Raises InputError: it is missing or malformed."""
+    try:
+        return tomllib.loads(read_file(path, "settings").decode())
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def with_tuples(values: Json) -> Json:
+    """Return values with tuples in place of lists, as dataclasses have them."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

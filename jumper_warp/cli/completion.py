@@ -79,7 +79,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import compare, doctor, export, info, list, rescore, sysid, train
+    from jumper_warp.cli import compare, doctor, export, info, list, rescore, sysid, train, try_task
+    from jumper_warp.evaluation.agents import AgentCfg
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
@@ -88,9 +89,10 @@ def settings_of(command: str) -> list[Any]:
     return {
         "train": [train.TrainArgs],
         "finetune": [FinetuneArgs],
-        "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
+        "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg, AgentCfg],
         "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
         "compare": [compare.CompareCfg],
+        "try": [try_task.TryCfg],
         "rescore": [rescore.RescoreCfg],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],

@@ -22,6 +22,8 @@ from jumper_warp.viz.plots import figure
 
 PICTURE, PAGE, DATA = "comparison.png", "comparison.md", "comparison.json"
 HEADER = ("metric", "arm", "seeds", "IQM", "95 % interval", "P(better)", "95 % interval", "p (Holm)", "verdict")
+SHOWN = ("Episode_Reward/", "Episode_Sum/", "Episode_Termination/", "Metrics/", "Train/")
+"""Begins of the logged names that `print_side_by_side` prints."""
 SENTENCES = {"better": "better than", "worse": "worse than"}  # By `Row.verdict`
 STYLE = """body { max-width: 70em; margin: 2em auto; font-family: sans-serif } table { border-collapse: collapse }
 td, th { border: 1px solid #ccc; padding: 0.2em 0.6em } img { max-width: 100% }"""
@@ -224,3 +226,21 @@ def lines(comparison: Comparison) -> list[str]:
         rich.add_row(arm, seeds, mean, interval, better, p, verdict)
     note = [line.replace("*", "") for line in verdicts(comparison)[len(comparison.arms) - 1 :]]
     return [*table_lines(rich), *note]
+
+
+def print_side_by_side(comparison: Comparison) -> None:
+    """Print reward terms and metrics of the log of all arms, interquartile means over seeds, without a test."""
+    from rich.table import Column, Table
+
+    from jumper_warp.utils.tables import print_table
+
+    arms = [arm.name for arm in comparison.arms]
+    rich = Table(Column("last logged, mean of the seeds", no_wrap=True), *arms, box=None)
+    for metric in dict.fromkeys(name for arm in comparison.arms for name in arm.members[0].last):
+        if metric.startswith(SHOWN):
+            values = (arm.last(metric) for arm in comparison.arms)
+            rich.add_row(
+                metric, *("–" if not len(each) else format_value(float(interquartile_mean(each))) for each in values)
+            )
+    print_table(rich)
+    print("short trainings show whether terms act as intended, not which task is better")

@@ -77,7 +77,7 @@ class Rescored:
         return replace(self.recording, series=series | self.recording.series)
 
     def plot(self, path: Path) -> None:
-        """Plot the sum of all rewards so far and the changed terms over time, a line for each robot, dashed: the base."""
+        """Plot the sum of all rewards so far and the changed terms over time, a line per robot; dashed: the base."""
         names = [TOTAL, *(name for name in self.changed if name != TOTAL)]
         settings: Any = {"figsize": (9.0, 2.2 * len(names) + 1.4), "sharex": True, "squeeze": False}
         with figure(path, len(names), 1, title=f"Rewards of {self.task}", **settings) as axes:

@@ -26,7 +26,7 @@ ROBOT, STATE, TERMINATION = "robot.", "state.", "termination"  # Begins of the k
 
 
 def robot_state(env: Env, worlds: Sequence[int]) -> dict[str, np.ndarray]:
-    """Return what `RobotView` is made of, and the termination's index (-1: none), of some worlds, (worlds, ...) each."""
+    """Return the arrays of `RobotView`, and the termination's index (-1: none), of some worlds, (worlds, ...) each."""
     state = {TERMINATION: env.episodes.termination.numpy()[list(worlds)].copy()}
     for name in RobotArrays.vars:
         if name not in SKIPPED:
