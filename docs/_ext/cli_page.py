@@ -19,6 +19,7 @@ from jumper_warp.cli.list import RunsCfg
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.rescore import RescoreCfg
+from jumper_warp.cli.sweep import SweepCfg
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
@@ -60,6 +61,7 @@ def cli_page() -> str:
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
         section("compare A B ...", doc(CompareCfg), list_flags(CompareCfg)),
         section("try FILE", doc(TryCfg), list_flags(TryCfg)),
+        section("sweep FILE", doc(SweepCfg), list_flags(SweepCfg)),
         section("rescore RECORDING", doc(RescoreCfg), list_flags(RescoreCfg)),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
@@ -80,7 +82,7 @@ def summary() -> str:
     anchors = {
         "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
-        "compare": "compare-a-b", "rescore": "rescore-recording", "try": "try-file",
+        "compare": "compare-a-b", "rescore": "rescore-recording", "sweep": "sweep-file", "try": "try-file",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()

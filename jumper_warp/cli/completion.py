@@ -79,7 +79,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import compare, doctor, export, info, list, rescore, sysid, train, try_task
+    from jumper_warp.cli import compare, doctor, export, info, list, rescore, sweep, sysid, train, try_task
     from jumper_warp.evaluation.agents import AgentCfg
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
@@ -93,6 +93,7 @@ def settings_of(command: str) -> list[Any]:
         "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
         "compare": [compare.CompareCfg],
         "try": [try_task.TryCfg],
+        "sweep": [sweep.SweepCfg],
         "rescore": [rescore.RescoreCfg],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],

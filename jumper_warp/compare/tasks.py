@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from jumper_warp.compare.arms import differences
-from jumper_warp.registry import TASKS, find_task, load_task_module, make_task
+from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.resume import flat_settings
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
@@ -43,8 +43,3 @@ def base_of(task: TaskCfg) -> str:
 def _settings(task: TaskCfg) -> dict:
     """Return the settings of a task by flag name."""
     return flat_settings({"train": {}, "env": {"task": task_to_json(task)}})
-
-
-def preset_of(name: str, base: str, preset: str = "laptop") -> str:
-    """Return the flags of a preset of a task or else of its base; empty: there is none."""
-    return next((found for each in (name, base) if (found := find_task(each)[1].presets.get(preset))), "")

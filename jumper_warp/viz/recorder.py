@@ -137,6 +137,8 @@ class Recorder:
         """
         if not self._times:
             raise InputError("the recording has no frames")
+        marks: Any = {"goals": goals, "heights": heights, "commands": self._commands or None}
+        marks = {name: np.asarray(values, np.float32) for name, values in marks.items() if values is not None}
         return Recording(
             times=np.array(self._times),
             worlds=self._worlds,
@@ -150,11 +152,7 @@ class Recorder:
             notes=self._notes,
             labels=self._labels,
             states={name: [frame[name] for frame in self._states] for name in self._states[0]},
-            **{
-                name: np.asarray(values, dtype=np.float32)
-                for name, values in (("goals", goals), ("heights", heights), ("commands", self._commands or None))
-                if values is not None
-            },
+            **marks,
         )
 
     def save_npz(self, path: Path) -> Path:

@@ -90,6 +90,16 @@ def test_the_page_has_settings_seeds_and_a_note_on_few_seeds(runs, tmp_path):
     assert "data:image/png" in path.read_text()
 
 
+def test_the_page_shows_the_changes_of_the_users_files(runs):
+    for name, weight in (("base", 1), ("tuck", 2)):
+        for folder in runs.glob(f"*_{name}"):
+            (folder / "sources").mkdir()
+            (folder / "sources/my_task.py").write_text(f"import warp\nWEIGHT = {weight}\n")
+    page = markdown(compared(runs, "base", "tuck"))
+    assert "### my_task.py of tuck" in page
+    assert "\n import warp\n-WEIGHT = 1\n+WEIGHT = 2\n" in page
+
+
 def test_a_single_arm_is_refused(runs):
     with pytest.raises(InputError, match="a comparison needs two arms, got base"):
         compared(runs, "base")
