@@ -57,7 +57,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sources = train_file(settings)
     from jumper_warp.compare.comparison import compare
     from jumper_warp.compare.report import lines, write_report
-    from jumper_warp.utils.output import output_dir
 
     primary = cfg.primary or settings.get("primary", "")
     conditions = dataclasses.replace(cfg.conditions, **settings.get("conditions", {}))
@@ -66,7 +65,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         evaluation=with_tuples(settings.get("evaluation", {})), title=settings.get("title", "Comparison"),
     )  # fmt: skip
     print("\n".join(lines(comparison)))
-    print(write_report(comparison, output_dir("compare", cfg.out), html=cfg.html))
+    print(write_report(comparison, cfg.out, html=cfg.html))
 
 
 def train_file(settings: Json) -> list[str]:

@@ -18,6 +18,7 @@ from jumper_warp.compare.comparison import Comparison, Row
 from jumper_warp.compare.statistics import FEWEST_SEEDS, bands, interquartile_mean
 from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.metrics import format_value, split_unit
+from jumper_warp.utils.output import output_dir
 from jumper_warp.viz.plots import figure
 
 PICTURE, PAGE, DATA = "comparison.png", "comparison.md", "comparison.json"
@@ -29,11 +30,12 @@ STYLE = """body { max-width: 70em; margin: 2em auto; font-family: sans-serif } t
 td, th { border: 1px solid #ccc; padding: 0.2em 0.6em } img { max-width: 100% }"""
 
 
-def write_report(comparison: Comparison, folder: Path, *, html: bool = False) -> Path:
-    """Write picture, Markdown page and data (JSON) of a comparison into a folder, and HTML if asked for.
+def write_report(comparison: Comparison, folder: Path | None = None, *, html: bool = False) -> Path:
+    """Write picture, Markdown page and data (JSON) of a comparison, perhaps HTML too, and return the path of the page.
 
-    Returns the path of the page.
+    folder: default outputs/compare/<time>.
     """
+    folder = output_dir("compare", folder)
     plot(comparison, folder / PICTURE)
     text = markdown(comparison)
     page = folder / PAGE
