@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import tomllib
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from typing import Annotated
 
 import tyro
 
+from jumper_warp.cli.flags import values_of
 from jumper_warp.cli.main import UsageError, parse
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.registry import load_task_module
@@ -46,23 +46,25 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     Raises InputError or OSError: a source, setting or file is invalid.
     """
-    cfg: CompareCfg = parse(CompareCfg, "compare", args)
+    path = values_of("--file", args)
+    settings = read_toml(Path(path[0])) if path else {}
+    conditions = Conditions(**settings.get("conditions", {}))
+    cfg: CompareCfg = parse(
+        CompareCfg, "compare", args, default=CompareCfg(primary=settings.get("primary", ""), conditions=conditions)
+    )
     if (cfg.file is None) == (len(cfg.sources) == 0):
         raise UsageError("name what to compare: jumper compare A B, or jumper compare --file FILE.toml")
-    settings = {}
     sources = cfg.sources
     if cfg.file is not None:
-        settings = read_toml(cfg.file)
         modules = [*modules, *(load_task_module(str(cfg.file.parent / name)) for name in settings.get("modules", ()))]
         sources = train_file(settings)
     from jumper_warp.compare.comparison import compare
     from jumper_warp.compare.report import lines, write_report
 
-    primary = cfg.primary or settings.get("primary", "")
-    conditions = dataclasses.replace(cfg.conditions, **settings.get("conditions", {}))
     comparison = compare(
-        *sources, metric=cfg.metric, primary=primary, evaluate=cfg.evaluate, conditions=conditions, modules=modules,
-        evaluation=with_tuples(settings.get("evaluation", {})), title=settings.get("title", "Comparison"),
+        *sources, metric=cfg.metric, primary=cfg.primary, evaluate=cfg.evaluate, conditions=cfg.conditions,
+        modules=modules, evaluation=with_tuples(settings.get("evaluation", {})),
+        title=settings.get("title", "Comparison"),
     )  # fmt: skip
     print("\n".join(lines(comparison)))
     print(write_report(comparison, cfg.out, html=cfg.html))

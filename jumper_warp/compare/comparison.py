@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -29,6 +29,7 @@ from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.catalog import ERRORS, SUCCESSES
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
@@ -153,8 +154,9 @@ def compare(
     sources: see `find_arms`. metric: logged one of the learning curves (default: the one that selects checkpoints).
     primary: metric that is tested, of the evaluation or the log, with a minus sign if smaller is better (default: the
     first of PRIMARY that the evaluation has, else `metric`). evaluate: run the evaluation of the best checkpoint of
-    every seed, as `jumper evaluate`. evaluation: changed flags of `jumper evaluate` by name, such as num_jumps.
-    conditions: of the evaluation (default: nominal). modules: the user's task modules.
+    every seed, as `jumper evaluate`, with the commands and terminations of the base's task. evaluation: changed flags
+    of `jumper evaluate` by name, such as num_jumps. conditions: of the evaluation (default: nominal). modules: the
+    user's task modules.
     Raises InputError: fewer than two arms, or see `find_arms`; PolicyError: a policy cannot be evaluated.
     """
     arms = find_arms(sources)
@@ -165,24 +167,37 @@ def compare(
     configure_device(conditions.device, conditions.threads)
     evaluated: list[Values] = [{} for _ in arms]
     if evaluate:
-        evaluated = [_evaluate(arm, evaluation or {}, conditions, modules) for arm in arms]
+        test = EvaluationRun(arms[0].members[0].folder, modules).task
+        evaluated = [_evaluate(arm, test, evaluation or {}, conditions, modules) for arm in arms]
     curve_metric = metric or arms[0].best_metric
     known = [name for name in PRIMARY if all(name.removeprefix("-") in values for values in evaluated)]
     shown = {} if not evaluate else {**dataclasses.asdict(conditions), **(evaluation or {})}
     return Comparison(arms, tuple(evaluated), curve_metric, primary or next(iter(known), curve_metric), shown, title)
 
 
-def _evaluate(arm: Arm, evaluation: Mapping[str, Any], conditions: Conditions, modules: Sequence[ModuleType]) -> Values:
-    """Return the metrics of all seeds of an arm in the evaluation of `jumper evaluate`, without undefined ones."""
+def _evaluate(
+    arm: Arm, test: TaskCfg, evaluation: Mapping[str, Any], conditions: Conditions, modules: Sequence[ModuleType]
+) -> Values:
+    """Return the metrics of all seeds of an arm in the evaluation of `jumper evaluate`, without undefined ones.
+
+    test: task of the base, whose commands and terminations all arms of the same kind of task have.
+    """
     rows = []
     with phase(f"evaluating {arm.name}", len(arm.members)) as advance:
         for member in arm.members:
             run = EvaluationRun(member.folder, modules)
-            flags = dataclasses.replace(default_flags(run.evaluation, "evaluate"), **evaluation)
+            own = test if run.task.state is test.state else run.task
+            flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
             run.conditions = conditions
-            log = flags.log(run.evaluation.prepare_task(run.task), conditions.stream_seed)
-            metrics = flags.metrics(run.run_episodes(run.env(log.count), log))
+            changed = partial(_with_terminations, own)
+            log = flags.log(changed(run.task), conditions.stream_seed)
+            metrics = flags.metrics(run.run_episodes(run.env(log.count, changed), log))
             rows.append({name: each.value for name, each in metrics.items() if isinstance(each.value, int | float)})
             advance()
     names = [name for name in rows[0] if all(name in row for row in rows)]
     return {name: np.array([row[name] for row in rows], dtype=float) for name in names}
+
+
+def _with_terminations(test: TaskCfg, task: TaskCfg) -> TaskCfg:
+    """Return a task as it is evaluated, with the terminations of the task `test`."""
+    return test.evaluation.prepare_task(dataclasses.replace(task, terminations=test.terminations))
