@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyInterface, checksum_entry
+from jumper_warp.utils.checks import check_number
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import parse_json, read_file, read_json
 
@@ -270,8 +270,7 @@ class JumpCommand:
 
         Raises InputError: it is out of range.
         """
-        if not isinstance(takeoff_speed, Real) or not 0.0 < takeoff_speed <= 20.0:
-            raise InputError(f"takeoff_speed must be above 0 to 20 m/s, got {takeoff_speed!r:.40}")
+        check_number("takeoff_speed", takeoff_speed, 1.0e-6, 20.0, "m/s")
         self._takeoff_speed = takeoff_speed
         self.requested = False
         self.in_flight = False
@@ -287,8 +286,7 @@ class JumpCommand:
         number of paws on the ground. Raises InputError, and changes nothing: one is not finite or implausible.
         """
         fastest = PLAUSIBLE["lin_vel"][0]
-        if not isinstance(vertical_velocity, Real) or not -fastest <= vertical_velocity <= fastest:
-            raise InputError(f"vertical_velocity must be within ±{fastest:g} m/s, got {vertical_velocity!r:.40}")
+        check_number("vertical_velocity", vertical_velocity, -fastest, fastest, "m/s")
         if paws_down not in range(5):
             raise InputError(f"paws_down must be 0, 1, 2, 3 or 4, got {paws_down!r:.40}")
         rises = vertical_velocity > self._takeoff_speed

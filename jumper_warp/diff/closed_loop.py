@@ -18,6 +18,7 @@ import warp as wp
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.diff.snapshot import Snapshot
 from jumper_warp.diff.torch_rollout import simulate
+from jumper_warp.utils.checks import check_flags
 from jumper_warp.utils.errors import InputError
 
 DOWN = (0.0, 0.0, -1.0)  # direction of gravity, world axes
@@ -95,6 +96,9 @@ class ClosedLoop:
         Raises InputError: several tasks, another solver, moving blocks, sensor latency, or a history of a term that is
         not a function of the robot's state alone.
         """
+        if not hasattr(env, "snapshot"):
+            raise InputError(f"env must be an Env, got {env!r:.60}")
+        check_flags(double=double)
         robots: Snapshot = env.snapshot()
         self.task = task = robots.tasks[0]
         if len(robots.tasks) > 1 or robots.solver != "SolverJumper":

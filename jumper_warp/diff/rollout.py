@@ -30,7 +30,7 @@ from jumper_warp.robot.motors import (
 from jumper_warp.sim.dynamics import JumperDynamics, WorldRange, check_step, slices_of
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_flags, check_within
+from jumper_warp.utils.checks import check_count, check_flags, check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
@@ -119,9 +119,9 @@ class Rollout(Uncopied):
     ):
         check_flags(double=double)
         substeps = check_step(dt, substeps)
-        every = substeps if every is None else every
-        if every not in range(1, substeps + 1) or substeps % every != 0:
-            raise InputError(f"every must be a divisor of substeps = {substeps}, got {every!r}")
+        every = substeps if every is None else check_count("every", every, substeps)
+        if substeps % every != 0:
+            raise InputError(f"every must be a divisor of substeps = {substeps}, got {every}")
         if tolerance is None:
             tolerance = TOLERANCE_DOUBLE if double else TOLERANCE
         self.dynamics = JumperDynamics(

@@ -12,7 +12,7 @@ import warp as wp
 from torch.autograd.forward_ad import unpack_dual
 
 from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
-from jumper_warp.utils.checks import check_within
+from jumper_warp.utils.checks import check_flags, check_type, check_within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import WARP_LOCK
 
@@ -62,6 +62,8 @@ def simulate(
     unknown parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass
     raises it for a parameter that a later call has changed and that was not passed to this call.
     """
+    check_type("rollout", rollout, Rollout)
+    check_flags(trusted=trusted)
     named = {"targets": targets, "q": q, "qd": qd, "initial_target": initial_target, "wrench": wrench} | parameters
     given: dict[str, Any] = {
         name: tensor for name, tensor in named.items() if tensor is not None or name in COMMANDS[:3]

@@ -36,7 +36,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of, with_own_ranges
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
-from jumper_warp.utils.checks import check_count, check_flags, check_seed
+from jumper_warp.utils.checks import check_count, check_flags, check_seed, check_type
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, loading_kernels, records
@@ -125,8 +125,7 @@ class Env(Stages):
         self.overlay = robot
         self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        if robot is not None and not isinstance(robot, RobotOverlay):
-            raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
+        check_type("robot (see load_overlay)", robot, RobotOverlay | None)
         own = [with_own_ranges(each, robot) if randomize else each for each in tasks]
         run = [each.in_conditions(randomize=randomize, noise=noise, ground_may_vary=may_vary) for each in own]
         self._draws_ground = any(each.draws_ground for each in run)
@@ -377,8 +376,9 @@ class Env(Stages):
         """Return the fields of every world's state of a task as arrays (num_envs, ...) (waits for the device).
 
         Also, of all worlds: base_pos [m], base_vel [m/s] of the centre of mass, base_quat (xyzw), done, termination
-        (index, -1: none), level.
+        (index, -1: none), level. Raises InputError (a ValueError): no such skill.
         """
+        self._check_skill(skill)
         state = records(self.skills[skill].states)
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
@@ -441,8 +441,10 @@ class Env(Stages):
     def mirror(self, what: str) -> Mirror:
         """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".
 
-        Raises ValueError: the mirror image of a term is not known.
+        Raises InputError (a ValueError): another text, or the mirror image of a term is not known.
         """
+        if what not in ("observation", "action"):
+            raise InputError(f"mirror needs 'observation' or 'action', got {what!r:.40}")
         return mirror_of_action() if what == "action" else mirror_of(self.task, "actor")
 
     def config(self) -> dict:

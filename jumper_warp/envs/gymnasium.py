@@ -19,7 +19,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.utils.checks import MOST_SEED, check_count, check_flags
+from jumper_warp.utils.checks import MOST_SEED, check_count, check_flags, check_type
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,9 +61,11 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: see the class; the modes' values "SameStep", "NextStep", "Disabled" are accepted too.
         render_mode: "rgb_array", or None to draw nothing. render_size: width and height of an image [px]. render_envs:
         number of worlds drawn, from the first on.
-        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another render_mode, a
-        size outside 16 to 7680 px, or render_envs no whole number of at least 1. ValueError: another autoreset_mode.
+        Raises InputError (a ValueError): env is another object, has no auto_reset or several tasks; another
+        render_mode, a size outside 16 to 7680 px, or render_envs no whole number of at least 1. ValueError: another
+        autoreset_mode.
         """
+        check_type("env", env, Env)
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -261,6 +263,7 @@ class GymEnv(gymnasium.Env):
         arguments: all_groups, render_mode and render_size as of `GymVectorEnv`. Raises InputError (a ValueError): more
         than one world, or as `GymVectorEnv`.
         """
+        check_type("env", env, Env)
         if env.num_envs != 1:
             raise InputError(f"gymnasium.make needs one world, got {env.num_envs}; gymnasium.make_vec takes num_envs")
         self._envs = GymVectorEnv(env, autoreset_mode=AutoresetMode.DISABLED, **arguments)
@@ -298,7 +301,7 @@ def _first(obs: Obs) -> Any:
 
 def _check_size(size: tuple[int, int]) -> None:
     """Raise InputError unless size is a width and a height of 16 to 7680 px."""
-    if not (len(size) == 2 and all(isinstance(length, Integral) and 16 <= length <= 7680 for length in size)):
+    if not (np.shape(size) == (2,) and all(isinstance(length, Integral) and 16 <= length <= 7680 for length in size)):
         raise InputError(f"render_size must be a width and a height of 16 to 7680 px, got {size}")
 
 

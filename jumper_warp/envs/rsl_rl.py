@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rsl_rl.env import VecEnv as RslRlEnv
 from tensordict import TensorDict
 
 from jumper_warp.envs.vec_env import VecEnv
+from jumper_warp.utils.checks import check_count, check_type
 from jumper_warp.utils.files import write_atomically
 
 
@@ -32,15 +34,17 @@ class RslRlVecEnv(RslRlEnv):
 
         metrics_every: policy steps between two reads of the metrics, which wait for the device; with the number of
             steps per iteration they are logged once per iteration. max_episode_length: policy steps; only reported.
+        Raises InputError: `env` is no `VecEnv`, or one of the numbers is no whole number of at least 1.
         """
+        check_type("env", env, VecEnv)
         self.env = env
         self.num_envs = env.num_envs
         self.num_actions = env.num_actions
-        self.max_episode_length = max_episode_length
+        self.max_episode_length = check_count("max_episode_length", max_episode_length, sys.maxsize)
         self.device = env.device
         self.cfg = EnvConfig(env.config())
         self._episode_length = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
-        self._metrics_every = metrics_every
+        self._metrics_every = check_count("metrics_every", metrics_every, sys.maxsize)
         self._steps = 0
 
     @property

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from jumper_warp.envs.gymnasium import GymVectorEnv
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 
 
@@ -24,8 +25,9 @@ class Sb3VecEnv(VecEnv):
     def __init__(self, envs: GymVectorEnv) -> None:
         """Adapt `envs` to Stable-Baselines3.
 
-        Raises InputError: it returns tensors, or its autoreset mode is not SAME_STEP.
+        Raises InputError: it is another object, returns tensors, or its autoreset mode is not SAME_STEP.
         """
+        check_type("envs", envs, GymVectorEnv)
         if envs.tensors or envs.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise InputError("Stable-Baselines3 needs arrays and autoreset_mode 'SameStep'")
         self.envs = envs

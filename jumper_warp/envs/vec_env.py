@@ -11,6 +11,7 @@ RAW_LIMIT = 100.0
 """Largest absolute value of an observation: `Env` clamps to it, so that no world can spoil the statistics."""
 
 
+@runtime_checkable
 class VecEnv(Protocol):
     """Environment for PPO: many worlds whose ended episodes are reset in `step`.
 

@@ -172,7 +172,7 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
     settings: keyword arguments of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
     """
     files: list[Path] = []
-    for path in data:
+    for path in map(Path, data):
         files += sorted(file for file in path.iterdir() if file.suffix in READERS) if path.is_dir() else [path]
     if not files:
         raise InputError(f"no npz, csv or parquet file in {', '.join(map(str, data))}")

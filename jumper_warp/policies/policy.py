@@ -52,6 +52,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import TaskError
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, read_json, write_atomically
 from jumper_warp.utils.normalise import normalise
@@ -332,6 +333,7 @@ def save_policy(
     overwrite: whether to replace an existing policy with all its files.
     Raises PolicyError: the folder exists and overwrite is not set, or it is not a policy's.
     """
+    check_type("policy", policy, Policy)
     folder = checked_folder(folder, overwrite)
     config = {**source_versions(), **policy.config}
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}

@@ -17,8 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
 from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.events_file import EventsFile
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
-from jumper_warp.rl.resume import flat_settings
 from jumper_warp.rl.run_names import SEED, title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean
@@ -197,7 +197,7 @@ class TrainingLog:
         """
         self.console = TrainingConsole(cfg, iteration) if console is None else console
         self._file = MetricsFile(folder / METRICS_FILE, iteration)
-        self._events = _event_writer(folder, iteration, config) if cfg.tensorboard else None
+        self._events = EventsFile(folder, iteration, config) if cfg.tensorboard else None
         self._disk_full = False
         self._wandb = _wandb(cfg.wandb, folder, config, cfg) if cfg.wandb else None
 
@@ -253,9 +253,7 @@ class TrainingLog:
         if not self._events:
             return
         try:
-            for name, value in metrics.items():
-                self._events.add_scalar(name, value, iteration)
-            self._events.flush()
+            self._events.add(iteration, metrics)
         except OSError as error:
             self.print_line(
                 f"no TensorBoard events from iteration {iteration} on: {error.strerror}; see {METRICS_FILE} instead"
@@ -355,18 +353,6 @@ def _mean_over(seeds: Sequence[dict[str, float]], name: str, form: str, interval
 def level_fractions(metrics: dict[str, float]) -> list[float]:
     """Return the fraction of worlds at each curriculum level and, last, of those that passed all; [] if not logged."""
     return [value for name, value in metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
-
-
-def _event_writer(folder: Path, iteration: int, config: dict[str, Any]) -> Any:
-    """Return a TensorBoard writer with the settings as hparams; it hides events after `iteration` in older files."""
-    from torch.utils.tensorboard import SummaryWriter
-    from torch.utils.tensorboard.summary import hparams
-
-    writer = SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
-    settings = {name: value for name, value in flat_settings(config).items() if isinstance(value, (bool, int, float))}
-    for summary in hparams(settings, {"Metrics/success": 0.0}):
-        writer._get_file_writer().add_summary(summary)
-    return writer
 
 
 def _wandb(project: str, folder: Path, config: dict[str, Any], cfg: TrainCfg) -> Any:

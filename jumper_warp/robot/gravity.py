@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from numbers import Real
-
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.checks import check_number
 
 EARTH = 9.81  # [m/s^2]
 MARS = 3.71  # [m/s^2]
@@ -13,5 +11,4 @@ MAX_GRAVITY = 100.0  # [m/s^2] four times Jupiter's
 
 def check_gravity(gravity: float) -> None:
     """Raise InputError unless the downward gravity [m/s^2] of a simulation is in 0 to MAX_GRAVITY."""
-    if not isinstance(gravity, Real) or not 0.0 <= gravity <= MAX_GRAVITY:
-        raise InputError(f"gravity must lie in 0 to {MAX_GRAVITY:g} m/s^2, downward, got {gravity!r:.40}")
+    check_number("downward gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")

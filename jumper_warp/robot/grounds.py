@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.checks import check_finite, check_not_negative, check_number, check_positive, check_seed
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     import newton
 
 SIZE = 4.0  # [m] Edge of the square, by default: a jump of 2 m from its middle ends on it
+HIGHEST = 100.0  # [m] Largest height of a platform or of uneven ground
+MOST_CELLS = 10_000  # Largest number of cells along an edge
 CELL = 0.02  # [m] Distance between nodes, by default: less than a paw's radius of 0.025 m
 
 
@@ -39,14 +43,13 @@ class BlockCfg:
     """[1] Coefficient of friction between block and floor."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if an extent or the mass is not positive, friction negative, or a center not finite."""
-        for name in ("half", "height", "mass"):
-            if not np.all(np.asarray(getattr(self, name)) > 0.0):
-                raise InputError(f"block {name} must be positive, got {getattr(self, name)}")
-        if not np.all(np.asarray(self.friction) >= 0.0):
-            raise InputError(f"block friction must not be negative, got {self.friction}")
-        if not np.all(np.isfinite(self.center)):
-            raise InputError(f"block center must be finite, got {self.center}")
+        """Raise InputError for no number or pair, an extent or mass not positive, or a friction coefficient below 0."""
+        for name, value in vars(self).items():
+            array = real_array(value, f"block {name}")
+            if name in ("center", "half") and array.shape[-1:] != (2,):
+                raise InputError(f"block {name} must be x and y, or have shape (num_worlds, 2), got {value!r:.60}")
+            check = {"center": check_finite, "friction": check_not_negative}.get(name, check_positive)
+            check(f"block {name}", *array.ravel())
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
         """Return position, size, mass and friction of the block in each world, as arrays by name.
@@ -65,14 +68,14 @@ def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: floa
     """Return a heightfield with a step at x = `edge` [m]: z = 0 before it, `height` [m] behind it, negative for a drop.
 
     The edge moves back to the nearest node, and the wall takes one cell. size: edge of the square [m]; cell: largest
-    distance between nodes [m]. Raises InputError: `height` is zero or not finite, an edge not between 0 and the rim,
-    or as `uneven` for size and cell.
+    distance between nodes [m]. Raises InputError: `height` is zero or beyond ±HIGHEST, an edge not between 0 and the
+    rim, or as `uneven` for size and cell.
     """
     x = _nodes(size, cell)
-    if not (np.isfinite(height) and height != 0.0):
-        raise InputError(f"platform height must be finite and not zero, got {height}")
-    if not 0.0 < edge < 0.5 * size:
-        raise InputError(f"platform edge must lie between 0 and {0.5 * size:g} m, got {edge}")
+    check_number("platform height", height, -HIGHEST, HIGHEST, "m")
+    if height == 0.0:
+        raise InputError("platform height must not be zero")
+    check_number("platform edge", edge, 1.0e-6, 0.5 * size - 1.0e-6, "m")
     row = np.where(x <= edge + 1.0e-9, 0.0, height)
     return _heightfield(np.tile(row, (len(x), 1)), size)
 
@@ -92,13 +95,14 @@ def uneven(
     two lengths beyond `flat_radius`. size: edge of the square [m]; cell: largest distance between nodes [m]. With the
     defaults slopes reach 20 to 25 degrees.
 
-    Raises InputError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
+    Raises InputError: an amplitude above HIGHEST, a length that is not positive or above `size`, more than MOST_CELLS
+    cells or less than 2 along an edge, no room beyond `flat_radius`, or no seed.
     """
     x = _nodes(size, cell)
-    if not (amplitude > 0.0 and length > 0.0):
-        raise InputError(f"uneven ground needs amplitude > 0 and length > 0, got {amplitude} and {length}")
-    if not 0.0 <= flat_radius < 0.5 * size:
-        raise InputError(f"flat_radius must lie between 0 and {0.5 * size:g} m, got {flat_radius}")
+    check_number("amplitude", amplitude, 1.0e-6, HIGHEST, "m")
+    check_number("length", length, 1.0e-6, size, "m")
+    check_number("flat_radius", flat_radius, 0.0, 0.5 * size - 1.0e-6, "m")
+    seed = check_seed(seed)
     bumps = _gaussian_field(np.random.default_rng(seed), len(x), x[1] - x[0], length)
     radius = np.hypot(x[:, None], x[None, :])
     ramp = np.clip((radius - flat_radius) / (2.0 * length), 0.0, 1.0)
@@ -108,8 +112,8 @@ def uneven(
 
 def _nodes(size: float, cell: float) -> np.ndarray:
     """Return coordinates of a square ground's grid along one axis [m], -size/2 to size/2, at most `cell` apart."""
-    if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
-        raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
+    check_number("size", size, 1.0e-3, 1.0e4, "m")
+    check_number("cell", cell, size / MOST_CELLS, 0.5 * size, "m")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
 
 

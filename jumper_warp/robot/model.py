@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from numbers import Real
 from types import ModuleType
 from typing import Any, cast
 
@@ -24,7 +23,7 @@ from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.legs import LegDimensions, knee_angles, leg_dimensions
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.utils.checks import check_count, check_flags
+from jumper_warp.utils.checks import check_count, check_flags, check_number, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.runtime import init_warp
@@ -91,13 +90,15 @@ def build_model(
 
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
-            unknown `ground`.
+            unknown `ground`; or an argument of another type.
     """
     num_worlds = check_count("num_worlds", num_worlds)
     check_flags(visuals=visuals, mujoco=mujoco)
-    if not isinstance(friction, Real) or not 0.0 <= friction <= MAX_FRICTION:
-        raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction!r:.40}")
+    check_number("friction", friction, 0.0, MAX_FRICTION)
     check_gravity(gravity)
+    check_type("description", description, RobotDescription | None)
+    check_type("extras", extras, Callable | None)
+    check_type("robot", robot, RobotValues | None)
     init_warp()
     description = load_description() if description is None else description
     builder = _empty_builder(gravity, mujoco)

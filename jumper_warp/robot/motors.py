@@ -20,7 +20,7 @@ from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed, check_types
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed, check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
 
@@ -103,6 +103,7 @@ class MotorCfg:
 
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
     """Return a motor type's gains, speeds and torques; commands are limited to `torque` [N m], at most the peak."""
+    check_type("torque", torque, float)
     pd = getattr(motor, gains)
     saturation = min(torque, motor.peak_torque)
     peak = motor.peak_torque

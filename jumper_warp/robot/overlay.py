@@ -18,6 +18,8 @@ from jumper_warp.robot import bounds
 from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_json, write_atomically
 
@@ -79,15 +81,17 @@ class RobotOverlay:
 
     def __post_init__(self) -> None:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
+        check_types("robot overlay", self)
         check_names("quantity", self.values, RANGES)
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))
         for name, values in self.values.items():
-            if len(values) != nominal[name].shape[1]:
-                raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got {len(values)}")
+            shape = real_array(values, f"robot overlay: {name}").shape
+            if shape != nominal[name].shape[1:]:
+                raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got shape {shape}")
             check_range(name, values, RANGES[name])
         for name, pair in self.randomization.items():
-            if len(pair) != 2 or not pair[0] <= pair[1]:
+            if real_array(pair, f"robot overlay: randomization {name}").shape != (2,) or not pair[0] <= pair[1]:
                 raise InputError(f"robot overlay: randomization {name!r:.60} must be [lower, upper], got {pair}")
             check_range(f"randomization {name}", pair, RANDOMIZED[name])
         robot = self.robots()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class TerrainCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if a count, length or slope of the map is out of range, or a kind of ground is unknown."""
+        check_types("terrain", self)
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
         for kind in self.kinds or ("",):

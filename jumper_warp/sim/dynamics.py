@@ -8,9 +8,7 @@ results depend neither on the slices nor on the threads.
 from __future__ import annotations
 
 import itertools
-import math
 import warnings
-from numbers import Real
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -29,7 +27,7 @@ from jumper_warp.robot.description import LEGS, RobotDescription, load_descripti
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import leg_geometry_array, other_colliders
 from jumper_warp.sim.precision import KernelModules, kernel_modules
-from jumper_warp.utils.checks import check_count
+from jumper_warp.utils.checks import check_count, check_number, check_positive, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.newton_types import Model, State
@@ -71,8 +69,7 @@ def check_step(dt: float, substeps: int = 1) -> int:
 
     Raises InputError: dt [s] not in the range DT, or substeps no whole number from 1 to MAX_SUBSTEPS.
     """
-    if not isinstance(dt, Real) or not DT[0] <= dt <= DT[1]:
-        raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
+    check_number("dt", dt, *DT, "s")
     return check_count("substeps", substeps, MAX_SUBSTEPS)
 
 
@@ -93,7 +90,11 @@ def advance_kernel(
 
 
 def check_model(model: Model) -> None:
-    """Raise NotThisRobotError unless every world of a model is this robot, with its labels in the expected order."""
+    """Raise NotThisRobotError unless every world of a model is this robot, with its labels in the expected order.
+
+    Raises InputError: it is no Newton model.
+    """
+    check_type("model", model, newton.Model)
     bodies = ["body"] + [f"{leg}_{link}" for leg in LEGS for link in LINKS]
     joints = ["base"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS] + [f"{leg}_ankle" for leg in LEGS]
     count = model.world_count
@@ -246,11 +247,11 @@ class JumperDynamics:
         Raises NotThisRobotError: the model is not this robot. InputError: `block` has another number of worlds,
         `max_sweeps` below 1, or `tolerance` not finite and positive.
         """
-        if max_sweeps < 1:
-            raise InputError(f"max_sweeps must be at least 1, got {max_sweeps}")
-        if not isinstance(tolerance, Real) or not 0.0 < tolerance < math.inf:
-            raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
         check_model(model)
+        check_type("description", description, RobotDescription | None)
+        check_type("block", block, BlockCfg | None)
+        max_sweeps = check_count("max_sweeps", max_sweeps)
+        check_positive("tolerance", tolerance)
         self.model = model
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance

@@ -25,7 +25,7 @@ from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange, chec
 from jumper_warp.sim.mujoco import MujocoDynamics
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_count, check_flags
+from jumper_warp.utils.checks import check_count, check_flags, check_type
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel
@@ -147,12 +147,9 @@ class Simulation(Uncopied):
         if solver not in ("jumper", "mujoco"):
             raise InputError(f"solver must be 'jumper' or 'mujoco', got {solver!r}")
         check_flags(keep_momentum=keep_momentum, observe_forces=observe_forces, visuals=visuals)
-        if not isinstance(block, BlockCfg | None):
-            raise InputError(f"block must be a BlockCfg, got {block!r:.60}")
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
-        if not isinstance(robot, RobotOverlay | RobotValues | None):
-            raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
+        check_type("robot (see load_overlay)", robot, RobotOverlay | RobotValues | None)
         num_worlds = check_count("num_worlds", num_worlds)
         substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
@@ -288,7 +285,16 @@ class Simulation(Uncopied):
 
         With delay [physics steps], (num_worlds,), they follow `previous` (12, num_worlds) until the target arrives.
         bodies: whether to write passive joints and bodies of the state. worlds: range to advance, by default all.
+        Raises InputError: substeps no whole number of at least 1, or arrays of another shape or type.
         """
+        substeps = check_count("substeps", substeps)
+        n = self.num_worlds
+        arrays = {"target": (target, (12, n)), "previous": (previous, (12, n)), "delay": (delay, (n,))}
+        for name, (array, shape) in arrays.items():
+            fits = isinstance(array, wp.array) and array.shape == shape
+            if not fits and (array is not None or name == "target"):
+                found = getattr(array, "shape", array)
+                raise InputError(f"{name} must be an array of shape {shape}, got {found!r:.60}")
         self.dynamics.follow(
             self.state, self.motors, target, self.dt, substeps, previous=previous, delay=delay, bodies=bodies,
             worlds=worlds,

@@ -17,6 +17,7 @@ from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, WorldRange, check_step, warn_of_colliders
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
 from jumper_warp.utils.newton_types import Control, Model, State
@@ -76,6 +77,7 @@ class SolverJumper(SolverBase):
                 not have one row per world.
         """
         super().__init__(model)
+        check_type("dynamics", dynamics, JumperDynamics | None)
         if dynamics is None:
             dynamics = JumperDynamics(
                 model, description=description, block=block, max_sweeps=max_sweeps, tolerance=tolerance
@@ -143,16 +145,18 @@ class SolverJumper(SolverBase):
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces of a control and the body wrenches of a state, or zeros where they are None."""
+        self._check_state("state_in", state)
         control = self._default_control if control is None else control
         body_f = self._no_body_f if state.body_f is None else state.body_f
-        self._check("control.joint_f", control.joint_f, self._state_shapes["joint_qd"])
+        self._check("control.joint_f", getattr(control, "joint_f", None), self._state_shapes["joint_qd"])
         self._check("state_in.body_f", body_f, self._state_shapes["body_q"])
         return control.joint_f, body_f
 
     def _check(self, name: str, array: wp.array | None, shape: tuple[int, ...]) -> None:
         """Raise InputError unless an array has the given shape and is on the model's device; kernels check neither."""
-        if array is None or array.shape != shape or array.device is not self.model.device:
-            found = "None" if array is None else f"{array.shape} on {array.device}"
+        is_array = isinstance(array, wp.array)
+        if not is_array or array.shape != shape or array.device is not self.model.device:
+            found = f"{array.shape} on {array.device}" if is_array else type(array).__name__
             raise InputError(
                 f"{name} must have shape {shape} on {self.model.device}, for {self.model.world_count} worlds of this "
                 f"solver's model, got {found}"
@@ -161,13 +165,13 @@ class SolverJumper(SolverBase):
     def _check_state(self, name: str, state: State) -> None:
         """Raise InputError unless the arrays of a state are those of a state of this model; name: for the message."""
         for field, shape in self._state_shapes.items():
-            self._check(f"{name}.{field}", getattr(state, field), shape)
+            self._check(f"{name}.{field}", getattr(state, field, None), shape)
 
     def _check_motors(self, motors: KernelStruct, **arrays: wp.array | None) -> None:
         """Raise InputError unless the given constants of motors, targets and delay fit the number of worlds."""
         n = self.model.world_count
         for name in MOTOR_CONSTANTS:
-            self._check(f"motors.{name}", getattr(motors, name), (12, n))
+            self._check(f"motors.{name}", getattr(motors, name, None), (12, n))
         for name, array in arrays.items():
             if array is not None:
                 self._check(name, array, (n,) if name == "delay" else (12, n))
@@ -181,7 +185,6 @@ class SolverJumper(SolverBase):
         Accelerations of bodies are changes of their velocities over the whole call, divided by its time.
         """
         substeps = check_step(dt, substeps)
-        self._check_state("state_in", state_in)
         if state_out is not state_in:
             self._check_state("state_out", state_out)
         qdd = state_out.body_qdd
@@ -221,6 +224,7 @@ class SolverJumper(SolverBase):
         """
         if state is None:
             raise InputError("update_contacts needs the state of the last step")
+        check_type("contacts", contacts, newton.Contacts)
         force = contacts.force
         if force is None:
             force = wp.zeros(contacts.rigid_contact_max, dtype=wp.spatial_vectorf, device=self.model.device)
@@ -234,7 +238,7 @@ class SolverJumper(SolverBase):
         dynamics = self.dynamics
         n = self.model.world_count
         device = self.model.device
-        self._check("state.body_q", state.body_q, self._state_shapes["body_q"])
+        self._check("state.body_q", getattr(state, "body_q", None), self._state_shapes["body_q"])
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
         if dynamics.ground_shape < 0:

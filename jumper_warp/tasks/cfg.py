@@ -95,6 +95,7 @@ class Command(Copyable):
 
     def __post_init__(self) -> None:
         """Raise InputError for one of resample_due and resample alone, or a wrong number of labels or bounds."""
+        check_types("command", self)
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
         labelled = all(LABEL.fullmatch(label) for label in self.labels) and len(set(self.labels)) == len(self.labels)

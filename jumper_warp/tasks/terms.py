@@ -24,7 +24,7 @@ from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.tasks.bounds import check_event_ranges, checked_number
 from jumper_warp.tasks.copying import Copyable, Struct
 from jumper_warp.tasks.functions import check_function, is_own, place_of, shown_type
-from jumper_warp.utils.checks import check_count, check_flags
+from jumper_warp.utils.checks import check_count, check_flags, check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -62,6 +62,7 @@ class Term(Copyable):
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
             raise InputError(f"{kind}: {func!r:.60} is not a @wp.func")
+        check_type(f"{kind}: name", name, str)
         self.func = func
         self.name = name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
@@ -230,6 +231,7 @@ class ObservationTerm(Term):
             if not low <= self.numbers[key] <= high:
                 limits = f"{low:g} to {high:g}, got {self.numbers[key]:.6g}"
                 raise InputError(f"ObservationTerm {self.name}: {key} must be in {limits}")
+        check_type(f"ObservationTerm {self.name}: mirror", self.options["mirror"], tuple[int, ...] | None)
         image = dict(enumerate(self.mirror or range(1, self.width + 1), 1))
         if len(image) != self.width or {abs(k): i if k > 0 else -i for i, k in image.items()} != image:
             wanted = f"1 to {self.width}, each once with a sign, and be its own inverse"
@@ -351,5 +353,6 @@ class StateMetric:
 
     def __post_init__(self) -> None:
         """Add the group Metrics/ to a name without a group, under which training logs show it."""
+        check_types("metric", self)
         if "/" not in self.name:
             object.__setattr__(self, "name", f"Metrics/{self.name}")

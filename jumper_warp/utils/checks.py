@@ -7,7 +7,7 @@ import functools
 import math
 import operator
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
@@ -56,6 +56,7 @@ def check_not_negative(name: str, *values: float) -> None:
 def _check_range(name: str, values: Iterable[float], low: float, expected: str) -> None:
     """Raise InputError, which names the `expected` property, unless all values are from `low` to FLOAT32_MAX."""
     for value in values:
+        check_type(name, value, float)
         if not low <= value <= FLOAT32_MAX:
             raise InputError(f"{name} must be {expected}, got {in_float32(value)}")
 
@@ -116,11 +117,26 @@ def check_types(section: str, cfg: Any) -> None:
     hints = _hints(type(cfg))
     for spec in dataclasses.fields(cfg):
         value = getattr(cfg, spec.name)
-        if not _fits(value, hints.get(spec.name, Any)):
-            raise InputError(f"{section} {spec.name} must be {_shown(hints[spec.name])}, got {value!r:.60}")
+        check_type(f"{section} {spec.name}", value, hints.get(spec.name, Any))
         for part in value if isinstance(value, tuple) else (value,):
             if dataclasses.is_dataclass(part) and not isinstance(part, type):
                 check_types(f"{section} {spec.name}", part)
+
+
+def check_type(name: str, value: Any, hint: Any) -> None:
+    """Raise InputError unless a value is of a type as in annotations, such as `Sequence[int] | None`.
+
+    bools are neither int nor float; numbers of NumPy are.
+    """
+    if not _fits(value, hint):
+        raise InputError(f"{name} must be {_shown(hint)}, got {value!r:.60}")
+
+
+def check_number(name: str, value: Any, low: float, high: float, unit: str = "") -> None:
+    """Raise InputError unless a value is a number from `low` to `high`, and no bool; unit: of the limits."""
+    if not _fits(value, float) or not low <= value <= high:
+        limits = f"{low:g} to {high:g}{unit and ' '}{unit}"
+        raise InputError(f"{name} must be in {limits}, got {value!s:.40}")
 
 
 @functools.cache
@@ -142,9 +158,12 @@ def _fits(value: Any, hint: Any) -> bool:
         if isinstance(value, tuple) and parts[-1:] == (Ellipsis,):
             return all(_fits(part, parts[0]) for part in value)
         return isinstance(value, tuple) and len(value) == len(parts) and all(map(_fits, value, parts))
+    if origin is Sequence:
+        return isinstance(value, Collection) and not isinstance(value, str) and all(_fits(x, parts[0]) for x in value)
     if hint in (float, int):
         return isinstance(value, Real if hint is float else Integral) and not isinstance(value, bool)
-    return hint is Any or not isinstance(hint, type) or isinstance(value, hint)
+    kind = origin or hint
+    return hint is Any or not isinstance(kind, type) or isinstance(value, kind)
 
 
 def _shown(hint: Any) -> str:
@@ -155,6 +174,8 @@ def _shown(hint: Any) -> str:
         return " or ".join(map(_shown, parts))
     if origin is tuple:
         return f"({', '.join(map(_shown, parts))})"
+    if origin is Sequence:
+        return f"a sequence of {_shown(parts[0])}"
     name = "..." if hint is Ellipsis else "None" if hint is type(None) else getattr(hint, "__name__", str(hint))
     return "a @wp.func" if name == "Function" else name
 
@@ -168,9 +189,8 @@ def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float
     for name, (low, high, unit) in bounds.items():
         value = getattr(cfg, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not low <= number <= high:
-                limits = f"{low:g} to {high:g}{unit and ' '}{unit}"
-                raise InputError(f"{section} {name} must be in {limits}, got {number!s:.40}")
+            if number is not None:
+                check_number(f"{section} {name}", number, low, high, unit)
 
 
 def check_seed(value: Any) -> int:

@@ -49,8 +49,8 @@ def output_dir(name: str, out: Path | None = None) -> Path:
     if name in ("", "..") or Path(name).name != name:
         raise InputError(f"an experiment name is one path component, got {name!r}")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        return out
+        Path(out).mkdir(parents=True, exist_ok=True)
+        return Path(out)
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     folder = Path("outputs", name, stamp)
     repeat = 1
@@ -70,6 +70,7 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
     scalars become Python numbers. folder: an existing folder; conditions: conditions of the evaluation by name. Raises
     InputError: a value is not finite. TypeError: JSON cannot hold it.
     """
+    folder = Path(folder)
     known = {name: _plain(name, value) for name, value in (conditions or {}).items()}
     converted = {}
     for key, value in metrics.items():
@@ -89,7 +90,7 @@ def read_values(folder: Path) -> Json:
 
     Raises InputError: the file is missing or damaged.
     """
-    path = folder / "metrics.json"
+    path = Path(folder) / "metrics.json"
     document = read_json(path, "metrics of an evaluation")
     try:
         return document["conditions"] | {key: entry["value"] for key, entry in document["metrics"].items()}

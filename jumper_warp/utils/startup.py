@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import gc
+import io
 import os
 import sys
+from contextlib import suppress
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from threading import RLock
@@ -72,10 +74,22 @@ class DeferredFinder(MetaPathFinder):
         return spec
 
 
-def open_standard_streams() -> None:
-    """Open standard streams that are closed, as by `>&-`, on the null device.
+class LossyFile(io.FileIO):
+    """Open file that discards what it cannot write, such as to a full device or a closed pipe."""
 
-    Otherwise the next opened file gets the number of such a stream, and the output of libraries.
+    def write(self, data: Any) -> int:
+        """Write bytes; return the number of those that are written or discarded."""
+        with suppress(OSError):
+            return super().write(data)
+        return len(data)
+
+
+def open_standard_streams() -> None:
+    """Open standard streams that are closed, as by `>&-`, on the null device; let standard error discard messages.
+
+    Otherwise the next opened file gets the number of such a stream, and the output of libraries. A message that cannot
+    be written, as with `2>/dev/full`, changes neither the result of a command nor its exit code, as with most Unix
+    tools.
     """
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
@@ -84,6 +98,10 @@ def open_standard_streams() -> None:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # gets the lowest free number, this one
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
+    if sys.stderr is sys.__stderr__:  # no capture, such as pytest's
+        buffer = io.BufferedWriter(LossyFile(sys.stderr.fileno(), "w", closefd=False))
+        settings = {"encoding": sys.stderr.encoding, "errors": sys.stderr.errors}
+        sys.stderr = io.TextIOWrapper(buffer, **settings, line_buffering=True)
 
 
 def prepare_imports() -> None:

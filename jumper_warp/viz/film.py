@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
@@ -59,6 +60,7 @@ def write_film(
     right, at the least distance that shows all). ranks: indices in `recording.worlds`, shown side by side (default:
     all). Raises InputError: see `check_film`, or too many frames for the format; OSError.
     """
+    check_type("recording", recording, Recording)
     path = Path(path)
     size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
     check_film(path, size, fps, speed, eye)
@@ -83,6 +85,9 @@ def write_film(
 
 def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye: Sequence[float] | None = None) -> None:
     """Raise InputError unless a film can be written with these arguments of `write_film`."""
+    check_type("size", size, Sequence[int])
+    check_type("fps", fps, float)
+    check_type("speed", speed, float)
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: the suffix of a film must be one of {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.progress import phase
@@ -221,6 +222,7 @@ def write_picture(
     the camera from the robot, world frame, of any length (default: from the right of the path). title: default: task
     and name of the world. Raises InputError: another suffix or width, or a vertical view; OSError.
     """
+    check_type("recording", recording, Recording)
     path = Path(path)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
         raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.checks import check_finite, check_number, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
-from jumper_warp.viz.recording import SERIES_NAME, Recording
+from jumper_warp.viz.recording import FARTHEST, SERIES_NAME, Recording
 from jumper_warp.viz.rerun import write_rrd
 from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
 
@@ -37,8 +39,18 @@ class Recorder:
 
         spacing: distance [m] along y between the drawings of consecutive worlds; 0 for true positions, required for a
         heightfield. notes: metadata of JSON types, saved with the recording. labels: names of the worlds.
-        Raises InputError: a world has no bodies, or a visible shape cannot be drawn.
+        Raises InputError: an argument of another type or out of range, a world that has no bodies or is given twice,
+        labels of another number than the worlds, or a visible shape that cannot be drawn.
         """
+        check_type("model", model, Model)
+        check_type("worlds", worlds, Sequence[int])
+        check_type("labels", labels, Sequence[str])
+        check_type("notes", notes, Mapping | None)
+        check_number("spacing", spacing, -FARTHEST, FARTHEST, "m")
+        if not 0 < len(worlds) == len(set(worlds)) or len(labels) not in (0, len(worlds)):
+            raise InputError(
+                f"worlds must differ, with a label each or none, got {worlds!r:.60}, labels {labels!r:.60}"
+            )
         world_of_body = model.body_world.numpy()
         for world in worlds:
             if world not in world_of_body:
@@ -82,19 +94,25 @@ class Recorder:
         commands: commanded velocities ahead, left [m/s] and about z [rad/s], (worlds, 3), in every frame or none.
         Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
+        check_finite("time", time)
+        check_type("series", series, Mapping | None)
+        check_type("states", states, Mapping | None)
         if self._times and not time > self._times[-1]:
             raise InputError(f"time must increase, got {time} s after {self._times[-1]} s")
-        poses = np.asarray(body_poses.numpy() if isinstance(body_poses, wp.array) else body_poses, dtype=np.float32)
+        poses = real_array(body_poses.numpy() if isinstance(body_poses, wp.array) else body_poses, "body_poses")
         if poses.shape != (self._body_count, 7):
             raise InputError(f"body_poses must have shape ({self._body_count}, 7), got {poses.shape}")
         contacts = self._checked_contacts(contact_points, contact_forces)
+        rows = None if commands is None else real_array(commands, "commands")
+        if rows is not None and rows.shape != (len(self._worlds), 3):
+            raise InputError(f"commands must have shape ({len(self._worlds)}, 3), got {rows.shape}")
         self._append_series({} if series is None else series)
         self._times.append(float(time))
         self._poses.append(poses[self._bodies])
         self._contacts.append(contacts)
         self._states.append(dict(states or {}))
-        if commands is not None:
-            self._commands.append(np.array(commands, dtype=np.float32).reshape(len(self._worlds), 3))
+        if rows is not None:
+            self._commands.append(rows.copy())
 
     def _append_series(self, series: Mapping[str, float]) -> None:
         """Append a frame's values of the series, by name. Raises InputError: a malformed, new or missing name."""
@@ -119,7 +137,7 @@ class Recorder:
             raise InputError("pass contact_points and contact_forces together, or neither")
         if points is None:
             points = forces = np.zeros((len(self._worlds), 0, 3))
-        points, forces = (np.array(given, dtype=np.float32) for given in (points, forces))
+        points, forces = (real_array(given, "contacts").copy() for given in (points, forces))
         if points.ndim == 2 and len(self._worlds) == 1:
             points, forces = points[None], forces[None]
         if points.ndim != 3 or points.shape[::2] != (len(self._worlds), 3) or forces.shape != points.shape:

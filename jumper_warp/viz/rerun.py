@@ -19,17 +19,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.rotations import turn_plane, yaw_of
 from jumper_warp.viz.props import goal_shapes
+from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR, LEG_COLORS
-
-if TYPE_CHECKING:
-    from jumper_warp.viz.recording import Recording
 
 TIMELINE = "time"  # name of the only timeline; durations [s]
 FORCE_SCALE = 1.0e-3  # [m/N] length of a contact arrow over its force
@@ -45,7 +44,7 @@ LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
 """Pattern of the name of a quantity of one leg: leg, motor if any, unit in brackets."""
 
 
-def write_rrd(recording: "Recording", path: Path) -> Path:
+def write_rrd(recording: Recording, path: Path) -> Path:
     """Write a recording atomically as a Rerun file (.rrd); return the path.
 
     Rerun collects it in memory: on a full disk its own writer would wait for ever.
@@ -53,6 +52,7 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
     """
     import rerun as rr
 
+    check_type("recording", recording, Recording)
     stream = rr.RecordingStream("jumper-warp")
     memory = stream.memory_recording()
     writer = _Writer(rr, stream, recording)
@@ -62,14 +62,14 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
         writer.log_world(rank)
     writer.log_series()
     writer.log_states()
-    write_atomically(path, memory.drain_as_bytes())
-    return path
+    write_atomically(Path(path), memory.drain_as_bytes())
+    return Path(path)
 
 
 class _Writer:
     """Writer of one recording to a Rerun stream, with one call for all frames of an entity."""
 
-    def __init__(self, rr: ModuleType, stream: Any, recording: "Recording") -> None:
+    def __init__(self, rr: ModuleType, stream: Any, recording: Recording) -> None:
         """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`."""
         self.rr = rr
         self.stream = stream
@@ -164,7 +164,7 @@ class _Writer:
         self.stream.send_columns(self.rr.new_entity_path(entity), self.times, columns)
 
 
-def _world_names(recording: "Recording") -> list[str]:
+def _world_names(recording: Recording) -> list[str]:
     """Return distinct names of the recorded worlds for entity paths: two worlds in one entity would overwrite."""
     labels = [recording.label(rank) for rank in range(len(recording.worlds))]
     return labels if len(set(labels)) == len(labels) else [f"world_{world}" for world in recording.worlds]
@@ -175,7 +175,7 @@ def _rgb(colors: Iterable[tuple[float, float, float]]) -> np.ndarray:
     return np.round(255.0 * np.clip(list(colors), 0.0, 1.0)).astype(np.uint8)
 
 
-def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarray]:
+def velocities(recording: Recording, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """Return commanded and actual horizontal velocity [m/s] of a world's base, world axes, (frames, 3) each.
 
     Commands are turned by the base's yaw; NaN is replaced by 0. Actual: central differences of the base's origin.
@@ -188,7 +188,7 @@ def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarra
     return commanded, actual
 
 
-def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
+def view_targets(recording: Recording) -> tuple[np.ndarray, float]:
     """Return the camera's target [m], world frame, (frames, 3), and the camera's distance from it [m].
 
     The target follows the mean horizontal position of the worlds' bases, at the mean of their extreme heights.
@@ -223,7 +223,7 @@ class _Plot:
         return ["series", self.group, self.title]
 
 
-def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
+def _plots(recording: Recording) -> dict[str, list[_Plot]]:
     """Return the plots of the series by group; one plot shows the same motor of all legs, or all paws.
 
     Curves are in the order of legs. Their colors are those of the leg, of the world if there are several, or else
@@ -247,7 +247,7 @@ def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
     return plots
 
 
-def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray) -> _Plot:
+def _curve(recording: Recording, group: str, quantity: str, values: np.ndarray) -> _Plot:
     """Return the plot of one series, values (frames,); its legend omits the label of the only world."""
     commanded = quantity.startswith("command")
     color = COMMAND_COLOR if commanded else ACTUAL_COLOR
@@ -261,7 +261,7 @@ def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray
     return _Plot(group, quantity, [label], [color], LINE_WIDTHS[0 if commanded else 1], values[:, None], False)
 
 
-def _blueprint(recording: "Recording") -> Any:
+def _blueprint(recording: Recording) -> Any:
     """Return the Rerun viewer's layout: scene and states on the left, plots on the right, motors in tabs.
 
     The viewer plays in a loop from the beginning, with all panels collapsed.
@@ -311,7 +311,7 @@ def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
     ]
 
 
-def _scene_view(recording: "Recording") -> Any:
+def _scene_view(recording: Recording) -> Any:
     """Return the view of the scene, whose camera follows `scene/view_target`."""
     import rerun.blueprint as rrb
 

@@ -3,28 +3,203 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
-from jumper_warp import Recipe, Simulation, build_model, load_policy, make_task, train
+from jumper_warp import Env, Recipe, Simulation, SolverJumper, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.diff.closed_loop import ClosedLoop
 from jumper_warp.diff.rollout import Rollout
+from jumper_warp.diff.torch_rollout import simulate
+from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.envs.sb3 import Sb3VecEnv
+from jumper_warp.evaluation.conditions import Conditions
+from jumper_warp.identification.motions import load_motions
 from jumper_warp.policies.catalog import ONNX, add_files
 from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.robot.motors import jumping_motors
+from jumper_warp.robot.grounds import BlockCfg, platform, uneven
+from jumper_warp.robot.motors import jumping_motors, walking_motors
+from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.robot.terrain import TerrainCfg
+from jumper_warp.tasks.terms import StateMetric
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.viz.film import check_film, write_film
+from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.recorder import Recorder
 from jumper_warp.viz.recording import load_npz
+from jumper_warp.viz.rerun import write_rrd
 
 POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
+HEIGHT = make_task("vertical-jump").observations.actor[0]
+COMMAND = make_task("vertical-jump").command
+
+
+@pytest.fixture(scope="module")
+def env():
+    return Env(make_task("vertical-jump"), 1, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build_model(1)
+
+
+def contacts_of(model):
+    return newton.CollisionPipeline(model).contacts()
+
+
+@pytest.mark.parametrize("other", [None, 3, "x", object(), ZEROS])
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (GymVectorEnv, "env"),
+        (GymEnv, "env"),
+        (Sb3VecEnv, "envs"),
+        (RslRlVecEnv, "env"),
+        (ClosedLoop, "env"),
+        (Rollout, "model"),
+        (SolverJumper, "model"),
+        (Recorder, "model"),
+        (lambda other: simulate(other, *map(torch.zeros, ((1, 12), 19, 18))), "rollout"),
+    ],
+)
+def test_another_object_in_place_of_an_environment_or_a_model_is_refused(make, name, other):
+    with pytest.raises(InputError, match=f"^{name} must be "):
+        make(other)
+
+
+def test_an_adapter_of_another_adapter_names_what_it_needs(env):
+    with pytest.raises(InputError, match=r"envs must be GymVectorEnv"):
+        Sb3VecEnv(env)
+    with pytest.raises(InputError, match=r"env must be Env"):
+        GymVectorEnv(GymVectorEnv(env))
+
+
+@pytest.mark.parametrize("other", [None, 3, "x"])
+def test_a_solver_steps_states_only(other, model):
+    solver = SolverJumper(model)
+    state = model.state()
+    for states in ((other, state), (state, other)):
+        with pytest.raises(InputError, match=r"^state_(in|out)\.joint_q must have shape"):
+            solver.step(*states, None, None, 0.002)
+    with pytest.raises(InputError, match=r"^control\.joint_f must have shape"):
+        solver.step(state, state, other or object(), None, 0.002)
+    with pytest.raises(InputError, match=r"^motors\.kp must have shape"):
+        solver.step_motors(state, state, other, None, 0.002, 1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env, model: RslRlVecEnv(env, metrics_every=0), "metrics_every"),
+        (lambda env, model: RslRlVecEnv(env, metrics_every=math.nan), "metrics_every"),
+        (lambda env, model: RslRlVecEnv(env, metrics_every=1.5), "metrics_every"),
+        (lambda env, model: RslRlVecEnv(env, max_episode_length="x"), "max_episode_length"),
+        (lambda env, model: env.task_arrays(1), "skill"),
+        (lambda env, model: env.task_arrays(-1), "skill"),
+        (lambda env, model: env.mirror("x"), "mirror"),
+        (lambda env, model: env.mirror(None), "mirror"),
+        (lambda env, model: GymVectorEnv(env, render_size=3), "render_size"),
+        (lambda env, model: build_model(1, robot=3), "robot"),
+        (lambda env, model: build_model(1, description=3), "description"),
+        (lambda env, model: build_model(1, extras=3), "extras"),
+        (lambda env, model: build_model(1, friction=True), "friction"),
+        (lambda env, model: build_model(1, gravity=True), "gravity"),
+        (lambda env, model: SolverJumper(model, block=3), "block"),
+        (lambda env, model: SolverJumper(model, description=3), "description"),
+        (lambda env, model: SolverJumper(model, max_sweeps=math.nan), "max_sweeps"),
+        (lambda env, model: SolverJumper(model, max_sweeps=1.5), "max_sweeps"),
+        (lambda env, model: SolverJumper(model, dynamics=3), "dynamics"),
+        (lambda env, model: Rollout(model, every=True), "every"),
+        (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
+        (lambda env, model: ClosedLoop(env, double="no"), "double"),
+        (lambda env, model: BlockCfg((0.9, 0.0), height="x"), "block height"),
+        (lambda env, model: BlockCfg((0.9, 0.0), mass=math.inf), "block mass"),
+        (lambda env, model: BlockCfg((0.9, 0.0), friction=math.inf), "block friction"),
+        (lambda env, model: BlockCfg((0.9,)), "block center"),
+        (lambda env, model: BlockCfg(None), "block center"),
+        (lambda env, model: BlockCfg((0.9, 0.0), half=0.4), "block half"),
+        (lambda env, model: platform("x"), "height"),
+        (lambda env, model: platform(1e9), "height"),
+        (lambda env, model: platform(0.2, edge="x"), "edge"),
+        (lambda env, model: platform(0.2, size=1e9), "size"),
+        (lambda env, model: platform(0.2, cell=1e-9), "cell"),
+        (lambda env, model: uneven("x"), "amplitude"),
+        (lambda env, model: uneven(math.inf), "amplitude"),
+        (lambda env, model: uneven(length=1e9), "length"),
+        (lambda env, model: uneven(flat_radius=None), "flat_radius"),
+        (lambda env, model: uneven(seed="x"), "seed"),
+        (lambda env, model: uneven(seed=-1), "seed"),
+        (lambda env, model: TerrainCfg(rows="x"), "rows"),
+        (lambda env, model: TerrainCfg(rows=1.5), "rows"),
+        (lambda env, model: TerrainCfg(kinds=3), "kinds"),
+        (lambda env, model: TerrainCfg(step=0.1), "step"),
+        (lambda env, model: RobotOverlay({"base_mass": 8}), "base_mass"),
+        (lambda env, model: RobotOverlay({"base_mass": ("8",)}), "base_mass"),
+        (lambda env, model: RobotOverlay({}, {"base_mass": 8}), "base_mass"),
+        (lambda env, model: RobotOverlay({}, {"base_mass": ("a", "b")}), "base_mass"),
+        (lambda env, model: RobotOverlay(3), "values"),
+        (lambda env, model: HEIGHT.replace(mirror=3), "mirror"),
+        (lambda env, model: HEIGHT.replace(mirror=("x",)), "mirror"),
+        (lambda env, model: HEIGHT.replace(name=3), "name"),
+        (lambda env, model: StateMetric(3, "level"), "name"),
+        (lambda env, model: simulate(Rollout(model), *map(torch.zeros, ((1, 12), 19, 18)), trusted="no"), "trusted"),
+        (lambda env, model: Recorder(model, labels=3), "labels"),
+        (lambda env, model: Recorder(model, labels=(1,)), "labels"),
+        (lambda env, model: Recorder(model, labels=("a", "b")), "labels"),
+        (lambda env, model: Recorder(model, spacing=math.nan), "spacing"),
+        (lambda env, model: Recorder(model, spacing="x"), "spacing"),
+        (lambda env, model: Recorder(model, worlds=3), "worlds"),
+        (lambda env, model: Recorder(model, worlds=()), "worlds"),
+        (lambda env, model: Recorder(model, worlds=(0, 0)), "worlds"),
+        (lambda env, model: Recorder(model, notes=3), "notes"),
+        (lambda env, model: Recorder(model).record("x", model.body_q), "time"),
+        (lambda env, model: Recorder(model).record(math.nan, model.body_q), "time"),
+        (lambda env, model: Recorder(model).record(0.0, None), "body_poses"),
+        (lambda env, model: Recorder(model).record(0.0, model.body_q, "x"), "series"),
+        (lambda env, model: Recorder(model).record(0.0, model.body_q, states="x"), "states"),
+        (lambda env, model: env.sim.advance(None, env.sim.target), "substeps"),
+        (lambda env, model: env.sim.advance(-1, env.sim.target), "substeps"),
+        (lambda env, model: env.sim.advance(1, None), "target"),
+        (lambda env, model: env.sim.advance(1, wp.zeros((12, 2), dtype=float, device="cpu")), "target"),
+        (lambda env, model: env.sim.advance(1, env.sim.target, delay=3), "delay"),
+        (lambda env, model: SolverJumper(model).update_contacts(None, model.state()), "contacts"),
+        (lambda env, model: SolverJumper(model).update_contacts(contacts_of(model), "x"), "state"),
+        (lambda env, model: save_policy(Path("none"), "vertical_jump"), "policy"),
+        (lambda env, model: jumping_motors("x"), "torque"),
+        (lambda env, model: jumping_motors(lateral_torque="x"), "torque"),
+        (lambda env, model: walking_motors(None), "torque"),
+        (lambda env, model: Conditions(latency="x"), "latency"),
+        (lambda env, model: Conditions(gain_scale=1.0), "gain_scale"),
+        (lambda env, model: Conditions(sensor_offset="x"), "sensor_offset"),
+        (lambda env, model: dataclasses.replace(COMMAND, labels=3), "labels"),
+        (lambda env, model: dataclasses.replace(COMMAND, least=0.0), "least"),
+        (lambda env, model: dataclasses.replace(COMMAND, optional="x"), "optional"),
+        (lambda env, model: write_film("x", Path("x.gif")), "recording"),
+        (lambda env, model: write_picture("x", Path("x.png")), "recording"),
+        (lambda env, model: write_rrd("x", Path("x.rrd")), "recording"),
+        (lambda env, model: check_film(Path("x.gif"), 3, 10.0, 1.0), "size"),
+        (lambda env, model: check_film(Path("x.gif"), (64, 64), "x", 1.0), "fps"),
+        (lambda env, model: check_film(Path("x.gif"), (64, 64), 10.0, None), "speed"),
+        (lambda env, model: Recorder(model).record(0.0, model.body_q, commands=ZEROS), "commands"),
+    ],
+)  # fmt: skip
+def test_an_argument_of_another_type_or_out_of_range_is_named(call, message, env, model):
+    with pytest.raises(InputError, match=message):
+        call(env, model)
 
 
 @pytest.mark.parametrize("name", [None, 1, [], np.zeros(2), b"vertical-jump"])
@@ -158,6 +333,16 @@ def test_a_task_is_registered_by_names_and_a_function(arguments):
 def test_switches_are_bools(call):
     with pytest.raises(InputError, match="must be True or False"):
         call()
+
+
+def test_paths_are_texts_too(tmp_path: Path, model):
+    recorder = Recorder(model)
+    recorder.record(0.0, model.body_q)
+    assert write_rrd(recorder.recording(), str(tmp_path / "a.rrd")).is_file()
+    with pytest.raises(InputError, match="no npz, csv or parquet file"):
+        load_motions([str(tmp_path)])
+    folder = output_dir("results", str(tmp_path / "out"))
+    assert write_metrics(str(folder), {"height_m": 0.5}).path.is_file()
 
 
 def test_a_recording_without_series_is_written(tmp_path: Path):

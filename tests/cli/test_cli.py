@@ -380,6 +380,13 @@ def redirected(redirection, *args, **environment):
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
 
 
+@pytest.mark.parametrize(("args", "code"), [("list", 0), ("info vertical_jump", 0), ("list --bogus", 2), ("no", 2)])
+def test_messages_that_cannot_be_written_do_not_change_result_and_exit_code(args, code):
+    done = [redirected(redirection, *args.split()) for redirection in ("", "2>/dev/full")]
+    assert [each.returncode for each in done] == [code, code]
+    assert done[0].stdout == done[1].stdout
+
+
 @pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_exit_with_0(redirection):
     done = redirected(redirection, "list")

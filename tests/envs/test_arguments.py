@@ -43,7 +43,7 @@ def test_integers_of_numpy_and_torch_are_counts():
         ({"noise": "no"}, "noise must be True or False, got 'no'"),
         ({"auto_reset": None}, "auto_reset must be True or False"),
         ({"visuals": 1.0}, "visuals must be True or False"),
-        ({"block": 3}, "block must be a BlockCfg, got 3"),
+        ({"block": 3}, "block must be BlockCfg or None, got 3"),
         ({"handovers": [3]}, r"handovers must be a sequence of Handover, got \[3\]"),
     ],
 )

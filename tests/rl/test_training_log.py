@@ -1,10 +1,12 @@
 import dataclasses
 import errno
 import json
+import threading
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from full_disk import full_disk
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
@@ -117,3 +119,19 @@ def test_resume_hides_tensorboard_events_of_later_iterations(cfg):
     half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
     assert event_steps(half.folder) == [1, 2, 3, 4, 5, 6]
+
+
+def test_events_that_cannot_be_written_end_with_one_line_and_the_log_continues(tmp_path, capsys, monkeypatch):
+    tracebacks = []
+    monkeypatch.setattr(threading, "excepthook", tracebacks.append)
+    with TrainingLog(tmp_path, {"train": {}, "env": {}}, dataclasses.replace(LOGGED, tensorboard=True)) as log:
+        log.log(1, METRICS | {"Loss/value": 1.0}, remaining=5.0)
+        with full_disk():
+            for iteration in (2, 3):
+                log.log(iteration, METRICS, remaining=5.0)
+        log.log(4, METRICS, remaining=5.0)
+    stderr = capsys.readouterr().err
+    assert stderr.count("no TensorBoard events from iteration 2 on") == stderr.count("TensorBoard") == 1
+    assert tracebacks == []
+    assert iterations(tmp_path / METRICS_FILE) == [1, 2, 3, 4]
+    assert event_steps(tmp_path) == [1]

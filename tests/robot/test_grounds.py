@@ -61,8 +61,8 @@ def test_cells_shrink_to_divide_the_size():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: grounds.platform(0.0), "height must be finite and not zero"),
-        (lambda: grounds.uneven(-0.05), "amplitude > 0"),
+        (lambda: grounds.platform(0.0), "height must not be zero"),
+        (lambda: grounds.uneven(-0.05), "amplitude must be in"),
     ],
 )
 def test_refuses_impossible_grounds(build, message):
