@@ -90,6 +90,14 @@ def test_the_page_has_settings_seeds_and_a_note_on_few_seeds(runs, tmp_path):
     assert "data:image/png" in path.read_text()
 
 
+def test_the_page_names_trainings_of_different_lengths(runs):
+    save_run(runs.parent, "short", 1, [0.3])
+    assert "**Trainings of different lengths**, iterations: base 20, short 10." in markdown(
+        compared(runs, "base", "short")
+    )
+    assert "different lengths" not in markdown(compared(runs, "base", "tuck"))
+
+
 def test_the_page_shows_the_changes_of_the_users_files(runs):
     for name, weight in (("base", 1), ("tuck", 2)):
         for folder in runs.glob(f"*_{name}"):
