@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ class Member:
     """One seed of an arm: the folder of a run or of a policy."""
 
     folder: Path
+    until: float = math.inf  # Last iteration that counts
 
     @cached_property
     def config(self) -> Json:
@@ -54,8 +56,8 @@ class Member:
 
     @property
     def last(self) -> dict[str, float]:
-        """Last logged metrics by name, without undefined ones."""
-        values = self.log[-1] if self.log else {}
+        """Last logged metrics by name up to `until`, without undefined ones."""
+        values = next((line for line in reversed(self.log) if line["iteration"] <= self.until), {})
         return {name: float(value) for name, value in values.items() if value is not None}
 
     def curve(self, metric: str) -> np.ndarray:
@@ -134,6 +136,13 @@ def find_arms(sources: Sequence[str | Path]) -> tuple[Arm, ...]:
             member = Member(folder)
             arms.setdefault(name, {})[member.seed, "" if member.log else str(folder)] = member
     return tuple(_arm(name, [members[key] for key in sorted(members)]) for name, members in arms.items())
+
+
+def of_equal_length(arms: Sequence[Arm]) -> tuple[Arm, ...]:
+    """Return arms whose last logged metrics are those of the last iteration that all runs have."""
+    ends = [member.last["iteration"] for arm in arms for member in arm.members if member.log]
+    until = min(ends, default=math.inf)
+    return tuple(Arm(arm.name, tuple(replace(member, until=until) for member in arm.members)) for arm in arms)
 
 
 def _arm(name: str, members: list[Member]) -> Arm:

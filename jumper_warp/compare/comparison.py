@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jumper_warp.compare.arms import Arm, differences, find_arms
+from jumper_warp.compare.arms import Arm, differences, find_arms, of_equal_length
 from jumper_warp.compare.statistics import (
     bands,
     holm,
@@ -159,7 +159,7 @@ def compare(
     user's task modules.
     Raises InputError: fewer than two arms, or see `find_arms`; PolicyError: a policy cannot be evaluated.
     """
-    arms = find_arms(sources)
+    arms = of_equal_length(find_arms(sources))
     if len(arms) < 2:
         names = ", ".join(arm.name for arm in arms)
         raise InputError(f"a comparison needs two arms, got {names}; name them: NAME=RUN OTHER=RUN")

@@ -168,11 +168,12 @@ def verdicts(comparison: Comparison) -> list[str]:
         f"{row.improvement:.2f}, p = {row.p_value:.2g}."
         for row in others
     ]
-    ends = {arm.name: arm.last("iteration") for arm in comparison.arms}
-    lengths = {name: int(end.min()) for name, end in ends.items() if len(end)}
+    ends = {arm.name: [each.log[-1]["iteration"] for each in arm.members if each.log] for arm in comparison.arms}
+    lengths = {name: min(end) for name, end in ends.items() if end}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        lines.append(f"**Trainings of different lengths**, iterations: {listed}.")
+        lines.append(f"**Trainings of different lengths**, iterations: {listed}. Logged metrics are those of iteration "
+                     f"{min(lengths.values())}.")  # fmt: skip
     if comparison.fewest_seeds < FEWEST_SEEDS:
         lines.append(f"**Fewer than {FEWEST_SEEDS} seeds** in an arm: intervals are unreliable, and a test can miss "
                      "any difference.")  # fmt: skip

@@ -56,8 +56,11 @@ def probability_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, 
 def rank_test(first: np.ndarray, second: np.ndarray) -> float:
     """Return the p-value of the exact two-sided rank test (Mann-Whitney) that two arms are equally good.
 
-    With ties it is the permutation distribution of the statistic, exact up to MOST_PERMUTATIONS.
+    With ties it is the permutation distribution of the statistic, exact up to MOST_PERMUTATIONS. 1 if an arm has one
+    seed.
     """
+    if min(len(first), len(second)) < 2:
+        return 1.0
     tied = len(np.unique([*first, *second])) < len(first) + len(second)
     method: Any = scipy.stats.PermutationMethod(n_resamples=MOST_PERMUTATIONS, rng=0) if tied else "exact"
     return float(scipy.stats.mannwhitneyu(first, second, method=method).pvalue)

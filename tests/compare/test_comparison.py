@@ -92,9 +92,9 @@ def test_the_page_has_settings_seeds_and_a_note_on_few_seeds(runs, tmp_path):
 
 def test_the_page_names_trainings_of_different_lengths(runs):
     save_run(runs.parent, "short", 1, [0.3])
-    assert "**Trainings of different lengths**, iterations: base 20, short 10." in markdown(
-        compared(runs, "base", "short")
-    )
+    comparison = compared(runs, "base", "short")
+    assert "**Trainings of different lengths**, iterations: base 20, short 10." in markdown(comparison)
+    assert comparison.primary[0].mean == pytest.approx(0.1)  # of iteration 10
     assert "different lengths" not in markdown(compared(runs, "base", "tuck"))
 
 

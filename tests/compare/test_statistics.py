@@ -40,6 +40,11 @@ def test_the_rank_test_with_ties_enumerates_permutations():
     assert rank_test(np.array([0.0, 0.0]), np.array([1.0, 1.0])) == pytest.approx(2.0 / 6.0)
 
 
+def test_a_single_seed_shows_no_difference():
+    assert rank_test(np.array([0.5]), np.array([0.5, 0.5, 0.5])) == 1.0
+    assert rank_test(np.array([0.5]), np.array([0.9])) == 1.0
+
+
 def test_holm_multiplies_the_smallest_p_value_by_the_number_of_tests():
     assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
