@@ -9,6 +9,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from jumper_warp.cli.compare import CompareCfg
 from jumper_warp.cli.completion import CompletionCfg, settings_of
 from jumper_warp.cli.drive import DriveCfg
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
@@ -18,9 +19,13 @@ from jumper_warp.cli.flags import Flag, list_flags
 from jumper_warp.cli.list import RunsCfg
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
+from jumper_warp.cli.rescore import RescoreCfg
+from jumper_warp.cli.sweep import SweepCfg
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.cli.try_task import TryCfg
+from jumper_warp.evaluation.agents import AgentCfg
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
 from jumper_warp.evaluation.suites import SUITES
@@ -33,6 +38,7 @@ COMMON = {
     "drive": ("agent", "solver", "ground", "port", "out", "friction", "latency", "gravity"),
     "play": ("seconds", "solver", "robot", "gravity", "video", "viewer", "out"),
     "evaluate": ("solver", "randomize", "noise", "seed", "robot", "gravity", "friction", "save-trials", "out"),
+    "compare": ("file", "primary", "metric", "evaluate", "html", "out"),
     "sysid fit": ("params", "mass", "torque-limit", "gain-preset", "out"),
     "sysid excite": ("params", "seconds", "robot", "seed", "out"),
 }
@@ -51,11 +57,16 @@ def cli_page() -> str:
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
-                 {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg)}),
+                 {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg),
+                  "Flags with --agent": list_flags(AgentCfg)}),
         section("drive POLICY ...", doc(DriveCfg), list_flags(DriveCfg)),
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
+        section("compare A B ...", doc(CompareCfg), list_flags(CompareCfg)),
+        section("try FILE", doc(TryCfg), list_flags(TryCfg)),
+        section("sweep FILE", doc(SweepCfg), list_flags(SweepCfg)),
+        section("rescore RECORDING", doc(RescoreCfg), list_flags(RescoreCfg)),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
@@ -77,6 +88,7 @@ def summary() -> str:
         "drive": "drive-policy",
         "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
+        "compare": "compare-a-b", "rescore": "rescore-recording", "sweep": "sweep-file", "try": "try-file",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()
@@ -97,7 +109,7 @@ def section(
     command: with its positional arguments. headings: names of the common flags by heading. more: further flags, each
     list in a collapsed block of its own.
     """
-    name = command.split(" POLICY")[0].split(" DATA")[0]
+    name = command.split(" POLICY")[0].split(" DATA")[0].split(" A B")[0]
     by_name = {flag.name: flag for flag in flags}
     if headings is None and name in COMMON:
         headings = {"Common flags": COMMON[name]}

@@ -61,7 +61,9 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     tasks = task_names()
     policies = tuple(policy_tasks())
-    names: dict[str, Iterable[str]] = dict.fromkeys(("play", "drive", "evaluate", "finetune", "export"), policies)
+    names: dict[str, Iterable[str]] = dict.fromkeys(
+        ("play", "drive", "evaluate", "finetune", "compare", "export"), policies
+    )
     names |= {"train": tasks, "info": (*tasks, *policies), "sysid": ("fit", "excite", "actuator")}
     names["completion"] = ("bash", "zsh")
     flags = {command: [flag for cfg in settings_of(command) for flag in list_flags(cfg)] for command in COMMANDS}
@@ -79,7 +81,21 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import doctor, drive, export, info, list, sysid, train, watch
+    from jumper_warp.cli import (
+        compare,
+        doctor,
+        drive,
+        export,
+        info,
+        list,
+        rescore,
+        sweep,
+        sysid,
+        train,
+        try_task,
+        watch,
+    )
+    from jumper_warp.evaluation.agents import AgentCfg
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
@@ -89,9 +105,13 @@ def settings_of(command: str) -> list[Any]:
         "train": [train.TrainArgs],
         "watch": [watch.WatchArgs],
         "finetune": [FinetuneArgs],
-        "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
+        "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg, AgentCfg],
         "drive": [drive.DriveCfg],
         "evaluate": [EvaluateCfg(default_flags(each, "evaluate")) for each in stock],
+        "compare": [compare.CompareCfg],
+        "try": [try_task.TryCfg],
+        "sweep": [sweep.SweepCfg],
+        "rescore": [rescore.RescoreCfg],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
         "list": [list.ListCfg],

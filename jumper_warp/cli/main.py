@@ -35,6 +35,10 @@ COMMANDS = {
     "play": "Record a policy for the Rerun viewer.",
     "drive": "Drive a robot from the browser.",
     "evaluate": "Measure a policy over many trials.",
+    "compare": "Compare trainings of several seeds: jumper compare A B.",
+    "try": "Train a changed task and its base briefly: jumper try FILE.py.",
+    "sweep": "Optimise settings of a training: jumper sweep FILE.toml.",
+    "rescore": "Evaluate changed rewards on a recorded motion.",
     "export": "Save a policy, or the robot for other simulators.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
@@ -42,7 +46,8 @@ COMMANDS = {
     "doctor": "Check the installation: versions, and a step on each device.",
     "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
-"""Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
+"""Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules), see MODULES."""
+MODULES = {"try": "try_task"}  # Module of `jumper_warp.cli` by command, where their names differ
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
@@ -101,7 +106,7 @@ def dispatch(args: Sequence[str]) -> None:
             from jumper_warp.registry import load_task_module
 
             modules += (load_task_module(file) for file in files)
-        importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
+        importlib.import_module(f"jumper_warp.cli.{MODULES.get(name, name)}").run(rest, modules)
     except Exception as error:
         paths = [*files, *(getattr(module, "__file__", None) for module in modules)]
         folders = {os.path.dirname(os.path.abspath(path)) for path in paths if path}

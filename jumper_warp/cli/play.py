@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from jumper_warp.cli.evaluate import open_run, parse, policy_of
+from jumper_warp.cli.flags import option_of, wants_help
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
@@ -17,9 +18,11 @@ Simulate a policy, and write a picture and a recording for the Rerun viewer;
 --viewer rerun opens it, --video FILE writes a film.
 jumper play --script FILE.json [flags] makes one robot walk and jump with
 several policies.
+jumper play TASK --agent zero|random|hold [flags] shows a task without a policy,
+and the range of each reward and the share of each termination.
 jumper play --dump FILE [flags] shows a state that a training has saved because a
 term was not finite."""
-SCRIPT, DUMP = "--script", "--dump"
+SCRIPT, DUMP, AGENT = "--script", "--dump", "--agent"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -38,6 +41,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         from jumper_warp.evaluation.commands import ScriptCfg, play_script
 
         play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))
+        return
+    if AGENT in map(option_of, args) and not wants_help(args[:1]):
+        from jumper_warp.evaluation.agents import AgentCfg, play_agent
+        from jumper_warp.registry import make_task
+
+        cfg = parse_flags(AgentCfg, f"play {args[0]}", args[1:])
+        play_agent(make_task(args[0]), cfg)
         return
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play

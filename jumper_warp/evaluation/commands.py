@@ -188,7 +188,7 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     live = Live(seconds) if cfg.viewer == "rerun" else None
     recorder = EnvRecorder(env, log, worlds, notes=notes, live=live and live.recording)
     stop = cfg.seconds is None
-    run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
+    run_evaluation(run.policy.act, env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=stop)
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):
         warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})

@@ -118,15 +118,19 @@ def run_evaluation(
     log: EvaluationLog,
     *,
     seconds: float | None = None,
+    on_begin: Callable[[], object] | None = None,
     on_step: Callable[[], object] | None = None,
     stop: bool = True,
 ) -> None:
     """Run one episode per world with the commands of the log, until all have ended.
 
     act: observations (num_envs, num_obs) to actions (num_envs, 12), such as `Policy.act`; seconds: maximum simulated
-    time (default: the log's); on_step: called after every policy step; stop: False to continue to the end of the time.
+    time (default: the log's); on_begin: called before the first policy step; on_step: called after every one; stop:
+    False to continue to the end of the time.
     """
     log.begin(env)
+    if on_begin is not None:
+        on_begin()
     steps = round((log.seconds if seconds is None else seconds) / env.step_dt)
     with phase(f"simulating {log.count} {log.row_name}{'s' * (log.count > 1)}", steps) as advance:
         for _ in range(steps):

@@ -6,11 +6,13 @@ Viewer and renderer are imported only when something is recorded.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.evaluation.motion import robot_state, task_state
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import motor_values
 from jumper_warp.utils.progress import phase
@@ -63,6 +65,12 @@ class EnvRecorder:
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)
         self.block_positions: list[np.ndarray] = []
+        self._robots: list[dict[str, np.ndarray]] = []
+        self._tasks: list[dict[str, np.ndarray]] = []
+
+    def begin(self) -> None:
+        """Store the task's state before the first policy step, so that `Recording.motion` is kept."""
+        self._tasks = [task_state(self.env, self.worlds)]
 
     def __call__(self) -> None:
         """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
@@ -74,6 +82,9 @@ class EnvRecorder:
         if self.block is not None:
             self.block_positions.append(block_positions(sim)[self.worlds])
         self.frames += 1
+        if self._tasks:
+            self._robots.append(robot_state(self.env, self.worlds))
+            self._tasks.append(task_state(self.env, self.worlds))
         self.recorder.record(
             self.frames * self.env.step_dt,
             poses.reshape(-1, 7),
@@ -157,6 +168,9 @@ class EnvRecorder:
 
         marks = self._marks()
         recording = self.recorder.recording(goals=marks.get("goals"), heights=marks.get("heights"))
+        frames = [robot | task for robot, task in zip(self._robots, self._tasks, strict=False)]
+        motion = {name: np.stack([frame[name] for frame in frames]) for name in (frames[0] if frames else ())}
+        recording = replace(recording, motion=motion)
         if self.block is None:
             return recording
         half, height = self.block["half"][self.worlds], self.block["height"][self.worlds]
@@ -166,13 +180,16 @@ class EnvRecorder:
 def save_recording(recording: Recording, folder: Path, name: str, **picture: Any) -> Path:
     """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the .rrd path.
 
-    picture: options of `write_picture`.
+    A recording with a `motion` is also written as `<name>.npz`, for `jumper rescore`. picture: options of
+    `write_picture`.
     """
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
     with phase(f"writing {name}.rrd"):
         path = write_rrd(recording, folder / f"{name}.rrd")
+    if recording.motion:
+        recording.save_npz(folder / f"{name}.npz")
     write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)), **picture)
     return path
 

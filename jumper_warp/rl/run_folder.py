@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -22,6 +23,7 @@ INTERRUPTED = 130  # Exit code of a training that a signal stopped
 AsRslRl = Callable[[VecEnv, int], Any]
 """Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
+SOURCES = "sources"  # Folder in a run's folder that holds copies of the user's files
 
 
 class TrainResult(NamedTuple):
@@ -59,8 +61,15 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> Json:
 
 
 def write_config(folder: Path, config: Json) -> None:
-    """Write the configuration of a training run to the run's folder, which exists. Raises OSError."""
+    """Write the configuration of a training run, and the user's files, to the run's folder, which exists.
+
+    Raises OSError.
+    """
     write_atomically(folder / CONFIG, json.dumps(config, indent=1).encode())
+    for module in config["sources"]:
+        source = Path(str(sys.modules[module].__file__))
+        (folder / SOURCES).mkdir(exist_ok=True)
+        write_atomically(folder / SOURCES / f"{module}.py", source.read_bytes())
 
 
 def report_non_finite(

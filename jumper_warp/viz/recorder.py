@@ -161,8 +161,9 @@ class Recorder:
         """
         if not self._times[first:]:
             raise InputError("the recording has no frames")
+        marks: Any = {"goals": goals, "heights": heights, "commands": self._commands[first:] or None}
+        marks = {name: np.asarray(values, np.float32) for name, values in marks.items() if values is not None}
         series = np.stack(self._series[first:], axis=1)
-        commands = self._commands[first:] or None
         return Recording(
             times=np.array(self._times[first:]),
             worlds=self._worlds,
@@ -176,11 +177,7 @@ class Recorder:
             notes=self._notes,
             labels=self._labels,
             states={name: [frame[name] for frame in self._states[first:]] for name in self._states[0]},
-            **{
-                name: np.asarray(values, dtype=np.float32)
-                for name, values in (("goals", goals), ("heights", heights), ("commands", commands))
-                if values is not None
-            },
+            **marks,
         )
 
     def save_npz(self, path: Path) -> Path:

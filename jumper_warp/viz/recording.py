@@ -29,6 +29,7 @@ ARRAYS = (
     "heights",
     "commands",
 )  # fields of `Recording` that are arrays
+MOTION = "motion/"  # Begin of the names of the file's arrays that `Recording.motion` holds
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
@@ -62,6 +63,9 @@ class Recording:
     """Commanded heights of the base at the apex [m], above z = 0, (num_worlds,); NaN or no worlds: none."""
     commands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
     """Commanded velocity ahead, to the left [m/s] and about z [rad/s], (num_frames, num_worlds, 3); no frames: none."""
+    motion: dict[str, np.ndarray] = field(default_factory=dict)
+    """Complete states by name, from which rewards can be evaluated (`jumper_warp.evaluation.motion`): after the policy
+    step of each frame `robot.<array>` and `termination`, before it `state.<field>`; (num_frames, num_worlds, ...)."""
 
     def label(self, rank: int) -> str:
         """Return the name of the rank-th recorded world."""
@@ -105,6 +109,7 @@ class Recording:
         arrays = {name: getattr(self, name) for name in ARRAYS}
         arrays["header"] = np.array(json.dumps(header))
         series = np.array(list(self.series.values()), dtype=np.float64)
+        arrays |= {MOTION + name: values for name, values in self.motion.items()}
         arrays["series"] = series.reshape(len(self.series), -1 if self.series else 0)
         for index, shape in enumerate(self.shapes):
             arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
@@ -152,6 +157,7 @@ def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
         notes=header["notes"],
         labels=tuple(header["labels"]),
         states=header["states"],
+        motion={name.removeprefix(MOTION): values for name, values in archive.items() if name.startswith(MOTION)},
     )
 
 
@@ -180,6 +186,8 @@ def _check_arrays(recording: Recording) -> None:
     ):
         values = getattr(recording, name)
         _check(name, values.dtype.kind in "fiu" and values.shape in shapes)
+    for values in recording.motion.values():
+        _check("motion", values.dtype.kind in "biuf" and values.shape[:2] == (frames, worlds))
     for values in recording.series.values():
         _check("series", values.dtype.kind in "fiu" and values.shape == (frames,))
     times = recording.times

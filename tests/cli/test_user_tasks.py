@@ -193,6 +193,7 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     assert err.count(warning) == 1 and "max-iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
+    assert (folder / "sources/my_jumps.py").read_bytes() == edited.read_bytes()
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4
 
 

@@ -135,7 +135,8 @@ class Commands:
             return
         task = None
         with contextlib.ExitStack() as stack:
-            if args[0] in OPENED and args[1:] and args[1][0] != "-" and args[1:2] != ["robot"]:
+            of_policy = args[1:] and args[1][0] != "-" and args[1] != "robot" and "--agent" not in args
+            if args[0] in OPENED and of_policy:
                 task = self.task_of(args[1])
                 for module in ("evaluate", "play") if task else ():
                     stack.enter_context(

@@ -1,0 +1,184 @@
+"""Sweep over settings of a training: Optuna chooses, each trial is a training of several seeds side by side.
+
+Any number of workers share one storage. A worker that dies loses nothing: another one, or the next call, continues its
+trial from the last checkpoint.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jumper_warp.compare.statistics import interquartile_mean
+from jumper_warp.compare.training import train_arm
+from jumper_warp.recipe import Recipe
+from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.run_names import seed_folders
+from jumper_warp.rl.training_run import TrainingRun
+from jumper_warp.utils.checks import check_types
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
+
+POLL = 2.0  # [s] Time between two looks at the trials of other workers
+RUN, ALIVE, WORKER = "run", "alive", "worker"  # Attributes of a trial: name of its run, time of the last sign, process
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Settings of a sweep, as in its file."""
+
+    name: str
+    task: str
+    parameters: Json
+    """By flag of `jumper train` without dashes: low and high, perhaps log or step; or choices."""
+    seeds: tuple[int, ...] = (1, 2, 3, 4)  # Seeds of each trial, trained side by side
+    trials: int = 20  # Number of trials that finish or are pruned
+    flags: str = ""  # Flags of `jumper train` for all trials
+    metric: str = "Metrics/success"  # Logged metric to optimise, interquartile mean over seeds
+    direction: Literal["maximize", "minimize"] = "maximize"
+    pruning: bool = True  # Whether trials below the median of the finished ones at the same iteration end early
+    startup_trials: int = 5  # Number of random trials before Optuna chooses, and before trials are pruned
+    seed: int = 0  # Seed of Optuna's choices
+    log_root: Path = Path("logs")  # Folder of the sweep's folder, `log_root/name`
+    storage: str = "sqlite"  # sqlite, journal (for folders on a network), or an URL of a database
+    grace: float = 300.0  # [s] Time without a sign of life after which another host's trial is continued
+    modules: tuple[str, ...] = field(default=())  # Files of tasks, relative to the sweep's file
+
+    def __post_init__(self) -> None:
+        """Raise InputError: a field is of another type, or there is no parameter."""
+        object.__setattr__(self, "log_root", Path(self.log_root))
+        check_types("sweep:", self)
+        if not self.parameters:
+            raise InputError("a sweep needs parameters, such as parameters.'ppo.lr' = {low = 1e-4, high = 1e-2}")
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the sweep, with storage, runs and report."""
+        return self.log_root / self.name
+
+    def distributions(self) -> Json:
+        """Return Optuna's distribution of each parameter. Raises InputError: one is malformed."""
+        from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+        kinds = {}
+        for name, spec in self.parameters.items():
+            try:
+                whole = all(type(spec.get(end)) is int for end in ("low", "high"))
+                number = IntDistribution if whole else FloatDistribution
+                kind: Any = CategoricalDistribution if "choices" in spec else number
+                kinds[name] = kind(**spec)
+            except (TypeError, ValueError, AttributeError) as error:
+                raise InputError(f"parameter {name}: {error}") from error
+        return kinds
+
+    def arguments(self, params: Json, run: str) -> list[str]:
+        """Return the arguments of `jumper train` for a trial. run: its name."""
+        chosen = [word for name, value in params.items() for word in (f"--{name}", *shlex.split(str(value)))]
+        seeds = ["--seeds", *map(str, self.seeds), "--run-name", run, "--log-root", str(self.folder)]
+        return [self.task, *shlex.split(self.flags), *chosen, *seeds, "--no-tensorboard"]
+
+
+def open_study(sweep: Sweep, worker: int = 0) -> Any:
+    """Return the Optuna study of a sweep, which is created if it does not exist; worker: index of this process."""
+    import optuna
+    from optuna.storages.journal import JournalFileBackend, JournalStorage
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sweep.folder.mkdir(parents=True, exist_ok=True)
+    storage: Any = sweep.storage
+    if storage == "sqlite":
+        storage = optuna.storages.RDBStorage(
+            f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
+        )
+    elif storage == "journal":
+        storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
+    pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
+    sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
+    return optuna.create_study(
+        study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
+        sampler=sampler,
+    )  # fmt: skip
+
+
+def work(sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe], worker: int = 0) -> None:
+    """Run trials until the sweep has `trials` finished or pruned ones, also those of workers that died.
+
+    recipe_of: function of arguments of `jumper train`. worker: index of this process.
+    """
+    from optuna.trial import TrialState
+
+    study = open_study(sweep, worker)
+    while True:
+        requeue_abandoned(study, sweep.grace)
+        states = [trial.state for trial in study.get_trials(deepcopy=False)]
+        done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
+        if done >= sweep.trials:
+            return
+        if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
+            time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
+        else:
+            run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+
+
+def requeue_abandoned(study: Any, grace: float) -> None:
+    """Queue the trials of workers that died once more, with the same parameters and run."""
+    from optuna.exceptions import UpdateFinishedTrialError
+    from optuna.trial import TrialState
+
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        attributes = trial.user_attrs
+        if RUN in attributes and not _is_alive(attributes, grace):
+            try:
+                study.tell(trial.number, state=TrialState.FAIL)
+            except (UpdateFinishedTrialError, ValueError):
+                continue  # another worker was first
+            study.enqueue_trial(trial.params, user_attrs={RUN: attributes[RUN]})
+
+
+def _is_alive(attributes: Json, grace: float) -> bool:
+    """Return whether the worker of a trial runs: its process on this host, else a sign within `grace` [s]."""
+    host, _, process = attributes[WORKER].partition(":")
+    if host == socket.gethostname():
+        return Path(f"/proc/{process}").exists()
+    return time.time() - attributes[ALIVE] < grace
+
+
+def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe]) -> None:
+    """Train the seeds of a trial, or continue its run, and save the result in the study."""
+    from optuna.exceptions import TrialPruned
+    from optuna.trial import TrialState
+
+    run = trial.user_attrs.get(RUN, f"trial_{trial.number:03d}")
+    trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}")
+    trial.set_user_attr(ALIVE, time.time())
+    trial.set_user_attr(RUN, run)
+    reported = [0]
+
+    def report(runs: dict[int, TrainingRun]) -> None:
+        """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
+        iteration = min(each.iteration for each in runs.values())
+        values = [each.metrics[sweep.metric] for each in runs.values() if sweep.metric in each.metrics]
+        due = iteration % next(iter(runs.values())).cfg.log_interval == 0
+        if due and len(values) == len(runs) and iteration > reported[0]:
+            reported[0] = iteration
+            trial.report(float(interquartile_mean(np.array(values))), iteration)
+            trial.set_user_attr(ALIVE, time.time())
+            if trial.should_prune():
+                raise TrialPruned(f"{run}: pruned at iteration {iteration}")
+
+    try:
+        folder = train_arm(recipe_of(sweep.arguments(trial.params, run)), report)
+    except TrialPruned as error:
+        print(error)
+        study.tell(trial, state=TrialState.PRUNED)
+        return
+    logged = [last_metrics(each) for each in seed_folders(folder).values()]
+    study.tell(trial, float(interquartile_mean(np.array([metrics[sweep.metric] for metrics in logged]))))

@@ -1,0 +1,120 @@
+import json
+
+import numpy as np
+import pytest
+
+from jumper_warp.compare.arms import find_arms
+from jumper_warp.compare.comparison import compare
+from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
+from jumper_warp.utils.errors import InputError
+from saved_runs import save_run
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for seed in range(1, 6):
+        save_run(tmp_path, "base", seed, [0.1, 0.5 + 0.01 * seed], rewards={"tuck": 0.0, "height": 1.0})
+        save_run(tmp_path, "tuck", seed, [0.2, 0.8 + 0.01 * seed], weight=7.0, rewards={"tuck": 0.3})
+    return tmp_path / "vertical-jump"
+
+
+def compared(runs, *sources, **settings):
+    return compare(*(runs / source for source in sources), evaluate=False, **settings)
+
+
+def test_runs_of_one_name_are_an_arm(runs):
+    arms = find_arms([runs])
+    assert [(arm.name, arm.seeds) for arm in arms] == [("base", [1, 2, 3, 4, 5]), ("tuck", [1, 2, 3, 4, 5])]
+
+
+def test_the_newest_run_of_a_name_and_seed_counts(runs):
+    newer = save_run(runs.parent, "base", 3, [0.9], start=7)
+    (arm,) = find_arms([runs / "bas*"])
+    assert arm.seeds == [1, 2, 3, 4, 5]
+    assert arm.members[2].folder == newer
+
+
+def test_runs_of_an_arm_must_have_equal_settings(runs):
+    with pytest.raises(InputError, match=r"runs named both differ in env\.rewards\.jump-height\.weight"):
+        find_arms([f"both={runs}"])
+
+
+def test_a_pattern_without_runs_is_refused(runs):
+    with pytest.raises(InputError, match="no such run"):
+        find_arms([runs / "bass*"])
+
+
+def test_separated_arms_of_five_seeds_differ(runs):
+    comparison = compared(runs, "base", "tuck")
+    base, tuck = comparison.primary
+    assert base.p_value is None
+    assert tuck.verdict == "better"
+    assert tuck.improvement == 1.0
+    assert tuck.mean == pytest.approx(0.83)
+    assert tuck.p_value == pytest.approx(2.0 / 252.0)
+
+
+def test_a_minus_sign_makes_smaller_values_better(runs):
+    _, tuck = compared(runs, "base", "tuck", primary="-Metrics/success").primary
+    assert (tuck.verdict, tuck.improvement) == ("worse", 0.0)
+
+
+def test_rows_of_rewards_have_no_test_and_skip_arms_without_the_term(runs):
+    rows = compared(runs, "base", "tuck").rewards
+    assert [(row.metric.split("/")[1], row.arm) for row in rows] == [
+        ("tuck", "base"), ("tuck", "tuck"), ("height", "base"),
+    ]  # fmt: skip
+    assert all(row.p_value is None for row in rows)
+
+
+def test_learning_curves_are_interpolated_by_steps_and_time(runs):
+    (arm, _) = compared(runs, "base", "tuck").arms
+    for axis, ends in ((0, (1920.0, 3840.0)), (1, (2.0, 4.0))):
+        x, values = arm.curves("Metrics/success", axis, points=3)
+        assert (x[0], x[-1]) == pytest.approx(ends if axis else (8 * arm.settings["ppo.num-steps"] * 10, x[-1]))
+        np.testing.assert_allclose(values[0], [0.1, 0.305, 0.51])
+
+
+def test_the_page_has_settings_seeds_and_a_note_on_few_seeds(runs, tmp_path):
+    comparison = compared(runs, "base", "tuck")
+    page = markdown(comparison)
+    assert "| env.rewards.jump-height.weight |" in page
+    assert "0.51, 0.52, 0.53, 0.54, 0.55" in page
+    assert "Fewer than 5 seeds" not in page
+    few = compare(*(f"{name}={runs}/*_000001*_{name}" for name in ("base", "tuck")), evaluate=False)
+    assert "**Fewer than 5 seeds**" in markdown(few)
+    path = write_report(few, tmp_path, html=True)
+    assert path.name == "comparison.html"
+    assert {PICTURE, PAGE, DATA} <= {each.name for each in path.parent.iterdir()}
+    assert json.loads((path.parent / DATA).read_text())["rows"][1]["arm"] == "tuck"
+    assert "data:image/png" in path.read_text()
+
+
+def test_the_page_names_trainings_of_different_lengths(runs):
+    save_run(runs.parent, "short", 1, [0.3])
+    comparison = compared(runs, "base", "short")
+    assert "**Trainings of different lengths**, iterations: base 20, short 10." in markdown(comparison)
+    assert comparison.primary[0].mean == pytest.approx(0.1)  # of iteration 10
+    assert "different lengths" not in markdown(compared(runs, "base", "tuck"))
+
+
+def test_the_page_shows_the_changes_of_the_users_files(runs):
+    for name, weight in (("base", 1), ("tuck", 2)):
+        for folder in runs.glob(f"*_{name}"):
+            (folder / "sources").mkdir()
+            (folder / "sources/my_task.py").write_text(f"import warp\nWEIGHT = {weight}\n")
+    page = markdown(compared(runs, "base", "tuck"))
+    assert "### my_task.py of tuck" in page
+    assert "\n import warp\n-WEIGHT = 1\n+WEIGHT = 2\n" in page
+
+
+def test_a_single_arm_is_refused(runs):
+    with pytest.raises(InputError, match="a comparison needs two arms, got base"):
+        compared(runs, "base")
+
+
+def test_policies_are_evaluated_with_changed_flags():
+    comparison = compare("vertical_jump", "mars_vertical_jump", evaluation={"num_jumps": 4})
+    assert comparison.primary_name == "success_rate"
+    assert [len(row.values) for row in comparison.primary] == [1, 1]
+    assert any(row.metric == "apex_error_abs_mean_m" for row in comparison.exploratory)

@@ -1,0 +1,103 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from jump_helpers import make_env, random_actions
+from jumper_warp import mdp
+from jumper_warp.cli.main import main
+from jumper_warp.compare.rescore import rescore
+from jumper_warp.compare.tasks import base_of, task_of
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder
+from jumper_warp.registry import make_task
+from jumper_warp.utils.errors import InputError
+
+TASK_FILE = """
+from dataclasses import replace
+from jumper_warp import make_task
+from jumper_warp.registry import register_task
+
+
+def {name}():
+    task = make_task("vertical-jump")
+    return replace(task, name="{name}", rewards=(task.rewards[0].replace(weight=80.0), *task.rewards[1:]))
+
+
+register_task("{name}", {name})
+"""
+
+
+@wp.func
+def height_reward(robot: mdp.RobotView, state: mdp.JumpState) -> float:
+    return robot.pos[2]
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Return a recording of two robots that fall, since their actions are random."""
+    env, log = make_env(2), JumpLog(np.full(2, 0.9), make_task("vertical-jump").termination_names)
+    recorder = EnvRecorder(env, log, [0, 1], notes={"task": "vertical-jump"})
+    actions = iter(random_actions(2, 90))
+    run_evaluation(
+        lambda obs: next(actions), env, log, seconds=1.5, on_begin=recorder.begin, on_step=recorder, stop=False
+    )
+    return recorder.recording()
+
+
+def with_reward(*terms):
+    task = make_task("vertical-jump")
+    return replace(task, rewards=(*task.rewards, *terms))
+
+
+def test_a_new_reward_is_paid_for_the_recorded_states_until_the_episode_ends(recording):
+    task = with_reward(mdp.RewardTerm(height_reward, weight=60.0))
+    result = rescore(recording, task, make_task("vertical-jump"))
+    heights = np.stack([recording.body_poses(rank)[:, 0, 2] for rank in (0, 1)], axis=1)
+    expected = np.where(result.running, heights, 0.0)  # 60 * height / 60 a step
+    np.testing.assert_allclose(result.terms["height_reward"], expected, rtol=1e-5, atol=1e-6)
+    assert not result.running.all()
+    assert result.changed == ["total", "height_reward"]
+
+
+def test_the_table_and_the_lanes_have_the_sums_of_task_and_base(recording, tmp_path):
+    result = rescore(recording, with_reward(mdp.RewardTerm(height_reward, weight=60.0)), make_task("vertical-jump"))
+    rows = {row.term: row for row in result.table}
+    total, new = rows["total"], rows["height_reward"]
+    assert new.base is None
+    assert total.task == pytest.approx(total.base + new.task, rel=1e-5)
+    lanes = result.with_lanes().series
+    np.testing.assert_allclose(lanes["rewards/height_reward, 0.90 m, jump 1 [1]"], result.terms["height_reward"][:, 0])
+    result.plot(tmp_path / "rewards.png")
+    assert (tmp_path / "rewards.png").stat().st_size > 10_000
+
+
+def test_a_recording_without_states_is_refused(recording):
+    task = make_task("vertical-jump")
+    with pytest.raises(InputError, match="no complete states"):
+        rescore(replace(recording, motion={}), task, task)
+
+
+def test_the_base_of_a_file_of_one_task_is_the_most_similar_task(tmp_path):
+    path = tmp_path / "rescored_height.py"
+    path.write_text(TASK_FILE.format(name="rescored_height"))
+    task = task_of(str(path))
+    assert task.name == "rescored_height"
+    assert base_of(task) == "vertical-jump"
+    path = tmp_path / "no_task_at_all.py"
+    path.write_text("")
+    with pytest.raises(InputError, match="registers no task"):
+        task_of(str(path))
+
+
+def test_the_command_rescores_the_recording_of_a_policy(tmp_path, capsys):
+    path = tmp_path / "rescored_twice.py"
+    path.write_text(TASK_FILE.format(name="rescored_twice"))
+    main(["play", "vertical_jump", "--height", "0.8", "--out", str(tmp_path / "play"), "--device", "cpu"])
+    main(["rescore", str(tmp_path / "play/jump.rrd"), "--task", str(path), "--out", str(tmp_path / "out")])
+    assert "jump_height" in capsys.readouterr().out
+    assert {"rewards.png", "jump.rrd", "jump.npz", "metrics.json"} <= {
+        file.name for file in (tmp_path / "out").iterdir()
+    }

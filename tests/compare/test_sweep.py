@@ -1,0 +1,144 @@
+import os
+import signal
+import time
+
+import pytest
+
+from jumper_warp.cli.main import main
+from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
+from jumper_warp.compare.arms import find_arms
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned
+from jumper_warp.compare.sweep_report import PICTURE, importances
+from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.run_names import seed_folders
+from jumper_warp.utils.errors import InputError
+
+optuna = pytest.importorskip("optuna")
+FILE = """
+task = "vertical-jump"
+flags = "--no-randomize --no-noise --history 1 --ppo.hidden 16 --num-envs 8 --max-iterations {iterations} \
+--log-interval 1 --save-interval 1 --device cpu"
+seeds = [1, 2]
+trials = {trials}
+startup_trials = 2
+metric = "Train/mean_episode_length"
+log_root = "{root}"
+storage = "{storage}"
+{more}
+[parameters]
+"env.rewards.jump-height.weight" = {{ low = 50.0, high = 400.0, log = true }}
+"ppo.epochs" = {{ low = 1, high = 3 }}
+"""
+
+
+def sweep_file(folder, iterations=2, trials=3, storage="sqlite", more=""):
+    path = folder / "two_settings.toml"
+    path.write_text(FILE.format(root=folder, iterations=iterations, trials=trials, storage=storage, more=more))
+    return path
+
+
+def states(sweep):
+    return [trial.state.name for trial in open_study(sweep).get_trials()]
+
+
+@pytest.mark.parametrize("storage", ["sqlite", "journal"])
+def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, storage):
+    path = sweep_file(tmp_path, trials=2, storage=storage)
+    main(["sweep", str(path)])
+    sweep = read_sweep(path)
+    assert states(sweep) == ["COMPLETE", "COMPLETE"]
+    path = sweep_file(tmp_path, trials=3, storage=storage)
+    main(["sweep", str(path)])
+    assert states(sweep) == ["COMPLETE"] * 3
+    page = (sweep.folder / "sweep.md").read_text()
+    assert all(f"| trial_00{number} | complete |" in page for number in range(3))
+    assert (sweep.folder / PICTURE).stat().st_size > 10_000
+    arms = find_arms([sweep.folder / "vertical-jump"])
+    assert [(arm.name, arm.seeds) for arm in arms] == [(f"trial_00{number}", [1, 2]) for number in range(3)]
+    trained = [arm.settings["env.rewards.jump-height.weight"] for arm in arms]
+    chosen = [trial.params["env.rewards.jump-height.weight"] for trial in open_study(sweep).get_trials()]
+    assert trained == pytest.approx(chosen)
+
+
+def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
+    path = sweep_file(tmp_path, trials=1)
+    work_on(path)
+    sweep = read_sweep(path)
+    (trial,) = open_study(sweep).get_trials()
+    (run,) = (sweep.folder / "vertical-jump").glob("*/")
+    values = [last_metrics(folder)["Train/mean_episode_length"] for folder in seed_folders(run).values()]
+    assert trial.value == pytest.approx(sum(values) / 2)
+    assert list(trial.intermediate_values) == [1, 2]
+
+
+def test_of_two_workers_one_is_killed_and_nothing_is_lost(tmp_path):
+    """The killed worker's trial is continued from its checkpoint by the other one."""
+    pytest.importorskip("submitit")
+    path = sweep_file(tmp_path, iterations=15, trials=3)
+    sweep = read_sweep(path)
+    jobs = submit(SweepCfg(path, workers=2, slurm=("timeout_min=10",)), sweep.folder)
+    killed = None
+    for _ in range(1200):
+        running = [trial for trial in open_study(sweep).get_trials() if len(trial.intermediate_values) > 2]
+        if running and killed is None:
+            killed = running[0]
+            os.kill(int(killed.user_attrs[WORKER].partition(":")[2]), signal.SIGKILL)
+        if states(sweep).count("COMPLETE") == 3:
+            break
+        time.sleep(0.5)
+    for job in jobs:
+        job.wait()
+    trials = open_study(sweep).get_trials()
+    assert sorted(trial.state.name for trial in trials) == ["COMPLETE", "COMPLETE", "COMPLETE", "FAIL"]
+    (again,) = [t for t in trials if t.user_attrs[RUN] == killed.user_attrs[RUN] and t.number != killed.number]
+    assert again.params == killed.params
+    assert min(again.intermediate_values) > 1  # it did not begin from scratch
+    assert len(list((sweep.folder / "vertical-jump").glob("*/"))) == 3
+
+
+def test_a_trial_of_another_host_is_queued_after_the_time_without_a_sign(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    study = open_study(sweep)
+    for sign in (time.time() - 100.0, time.time()):
+        trial = study.ask(sweep.distributions())
+        for name, value in ((WORKER, "elsewhere:1"), (ALIVE, sign), (RUN, f"trial_{trial.number:03d}")):
+            trial.set_user_attr(name, value)
+    requeue_abandoned(study, grace=50.0)
+    assert states(sweep) == ["FAIL", "RUNNING", "WAITING"]
+    assert study.ask(sweep.distributions()).user_attrs[RUN] == "trial_000"
+
+
+def test_pruning_ends_a_trial_below_the_median(tmp_path):
+    path = sweep_file(tmp_path, trials=4, more='direction = "minimize"')
+    sweep = read_sweep(path)
+    study = open_study(sweep)
+    for _ in range(3):  # finished trials with values that no training reaches
+        trial = study.ask(sweep.distributions())
+        trial.set_user_attr(RUN, f"trial_{trial.number:03d}")
+        for iteration in (1, 2):
+            trial.report(0.1, iteration)
+        study.tell(trial, 0.1)
+    work_on(path)
+    last = open_study(sweep).get_trials()[-1]
+    assert last.state.name == "PRUNED"
+    assert list(last.intermediate_values) == [1]
+
+
+def test_importances_find_the_parameter_that_matters():
+    study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
+    study.optimize(lambda trial: trial.suggest_float("a", 0, 1) + 0.0 * trial.suggest_float("b", 0, 1), n_trials=60)
+    weights = importances(study)
+    assert weights["a"] > 0.8
+    assert sum(weights.values()) == pytest.approx(1.0)
+
+
+def test_wrong_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="a sweep needs parameters"):
+        Sweep("a", "vertical-jump", {})
+    sweep = Sweep("a", "vertical-jump", {"ppo.lr": {"low": 1.0}})
+    with pytest.raises(InputError, match=r"parameter ppo\.lr"):
+        sweep.distributions()
+    path = tmp_path / "sweep.toml"
+    path.write_text("task = 'vertical-jump'\nnothing = 1")
+    with pytest.raises(InputError, match="nothing"):
+        read_sweep(path)

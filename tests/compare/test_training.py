@@ -1,0 +1,91 @@
+import dataclasses
+
+import pytest
+
+from jumper_warp.cli.main import main
+from jumper_warp.cli.train import parse_train
+from jumper_warp.compare.training import train_arm
+from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.utils.errors import InputError
+
+SMALL = "--no-randomize --no-noise --history 1 --ppo.hidden 16 --num-envs 8 --log-interval 1 --save-interval 1"
+TASK = """
+from dataclasses import replace
+from jumper_warp import make_task
+from jumper_warp.registry import register_task
+
+
+def heavier_height():
+    task = make_task("vertical-jump")
+    return replace(task, name="heavier-height", rewards=(task.rewards[0].replace(weight=300.0), *task.rewards[1:]))
+
+
+register_task("heavier-height", heavier_height)
+"""
+
+
+def recipe(root, *flags):
+    arguments = [*SMALL.split(), "--device", "cpu", "--seeds", "1", "2", "--run-name", "arm", "--log-root", str(root)]
+    return parse_train(["vertical-jump", *arguments, *flags])[0]
+
+
+def test_a_finished_arm_is_kept_and_a_stopped_one_continues(tmp_path):
+    def stop(runs):
+        if runs[1].iteration == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_arm(recipe(tmp_path, "--max-iterations", "3"), stop)
+    iterations = []
+    folder = train_arm(recipe(tmp_path, "--max-iterations", "3"), lambda runs: iterations.append(runs[1].iteration))
+    assert iterations == [3]
+    assert last_metrics(folder / "seed_2")["iteration"] == 3
+    assert train_arm(recipe(tmp_path, "--max-iterations", "3"), lambda runs: pytest.fail("it trains")) == folder
+    assert len(list((tmp_path / "vertical-jump").iterdir())) == 1
+
+
+def test_an_arm_with_other_settings_is_refused(tmp_path):
+    train_arm(recipe(tmp_path, "--max-iterations", "1"))
+    with pytest.raises(InputError, match=r"trained with another env\.rewards\.jump-height\.weight"):
+        train_arm(recipe(tmp_path, "--max-iterations", "1", "--env.rewards.jump-height.weight", "7"))
+    renamed = recipe(tmp_path, "--max-iterations", "1", "--env.rewards.jump-height.weight", "7")
+    renamed = dataclasses.replace(renamed, train=dataclasses.replace(renamed.train, run_name="other"))
+    assert train_arm(renamed).name.endswith("_other")
+
+
+def test_a_file_of_arms_is_trained_and_compared(tmp_path, capsys):
+    (tmp_path / "arms_of_a_file.py").write_text(TASK)
+    path = tmp_path / "arms.toml"
+    path.write_text(f"""
+title = "Weights of the height"
+task = "vertical-jump"
+flags = "{SMALL} --device cpu --max-iterations 1"
+seeds = [1, 2]
+log_root = "{tmp_path}/logs"
+modules = ["arms_of_a_file.py"]
+primary = "fall_rate"
+arms.base = ""
+arms.half = "--env.rewards.jump-height.weight 100"
+arms.heavier = {{ task = "heavier-height" }}
+evaluation = {{ num_jumps = 4, height_range = [0.5, 0.6] }}
+conditions = {{ friction = 0.7, device = "cpu" }}
+""")
+    out = tmp_path / "out"
+    main(["compare", "--file", str(path), "--out", str(out)])
+    printed = capsys.readouterr().out
+    assert [name in printed for name in ("base", "half", "heavier", "fall_rate")] == [True] * 4
+    page = (out / "comparison.md").read_text()
+    assert page.startswith("# Weights of the height")
+    assert "| env.rewards.jump-height.weight | 40.0 | 100.0 | 300.0 |" in page
+    assert "friction 0.7" in page
+
+
+def test_try_prints_the_terms_of_a_change_and_its_base(tmp_path, capsys):
+    (tmp_path / "tried_height.py").write_text(TASK.replace("heavier", "tried"))
+    flags = ["--max-iterations", "1", "--num-envs", "8", "--seeds", "1", "2", "--device", "cpu"]
+    main(["try", str(tmp_path / "tried_height.py"), *flags, "--out", str(tmp_path / "out")])
+    lines = capsys.readouterr().out.splitlines()
+    (row,) = (line.split() for line in lines if "Episode_Reward/jump_height" in line)
+    assert float(row[2]) == pytest.approx(7.5 * float(row[1]), rel=0.05)
+    assert (tmp_path / "out/try.png").exists()
+    assert "not which task is better" in lines[-2]
