@@ -102,8 +102,8 @@ class Recipe:
         settings: Any = {name: getattr(self, name) for name in ("solver", "randomize", "noise", "robot")}
         return Env(self.task, num_envs, seed=seed, device=str(device), **settings)
 
-    def tested_task(self, randomize: bool) -> TaskCfg:
-        """Return the task of a test: without rewards and critic, and with events only if robots are randomised.
+    def tested_task(self, randomize: bool, rewards: bool = False) -> TaskCfg:
+        """Return the task of a test: without critic, with rewards and events only if asked for and if randomised.
 
         Raises TaskError: events are needed, and their functions were not found.
         """
@@ -111,7 +111,8 @@ class Recipe:
             raise TaskError(self.missing)
         observations = dataclasses.replace(self.task.observations, critic=())
         events = self.task.events if randomize else ()
-        return dataclasses.replace(self.task, rewards=(), observations=observations, events=events)
+        kept = self.task.rewards if rewards else ()
+        return dataclasses.replace(self.task, rewards=kept, observations=observations, events=events)
 
 
 def _imported() -> list[ModuleType]:

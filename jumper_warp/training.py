@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 def train(
     recipe: Recipe, *, seeds: Sequence[int] | None = None, checkpoints: Sequence[Checkpoint] = (),
-    command: str | None = None, expected_rate: float = 0.0,
+    command: str | None = None, expected_rate: float = 0.0, observers: Sequence[runner.Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy, or one of each seed, save checkpoints in a new run's folder, and return the result.
 
     seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
-    (default: those that `recipe.train.resume` selects). command, expected_rate: as in `jumper_warp.rl.runner.train`,
-    which lists the errors. Also raises InputError: the task cannot be saved, or has no mirror image and a symmetric
-    policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
+    (default: those that `recipe.train.resume` selects). command, expected_rate, observers: as in
+    `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, or has no
+    mirror image and a symmetric policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
     """
     if not isinstance(recipe, Recipe):
         raise InputError(f"train needs a Recipe, such as Recipe.of(name), got {recipe!r:.60}")
@@ -43,6 +43,8 @@ def train(
     if cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     if cfg.seeds:
-        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints)
+        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
     checkpoint = checkpoints[0] if checkpoints else None
-    return runner.train(cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate)
+    return runner.train(
+        cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate, observers
+    )  # fmt: skip

@@ -57,8 +57,8 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "trajectory.smoothing", "trajectory.whole_body",
     )),
     "viz": ("Recordings and pictures", (
-        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer",
-        "viz.viser", "viz.scene", "viz.props", "viz.style",
+        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.rerun_server",
+        "viz.live_recording", "viz.renderer", "viz.viser", "viz.scene", "viz.props", "viz.style",
     )),
     "utils": ("Errors and output", (
         "utils.errors", "utils.metrics", "utils.output", "utils.runtime", "utils.streams",

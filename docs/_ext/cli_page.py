@@ -47,6 +47,7 @@ def cli_page() -> str:
     parts = [
         section("train TASK", COMMANDS["train"], list_flags(train), headings={"Common flags": SHORT_HELP},
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
+        section("watch RUN", doc(settings_of("watch")[0]), list_flags(settings_of("watch")[0])),
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
@@ -72,7 +73,8 @@ def cli_page() -> str:
 def summary() -> str:
     """Return the Markdown table of all commands and their purposes."""
     anchors = {
-        "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "drive": "drive-policy",
+        "train": "train-task", "watch": "watch-run", "finetune": "finetune-policy", "play": "play-policy",
+        "drive": "drive-policy",
         "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
     }  # fmt: skip

@@ -79,7 +79,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are a command's flags for all kinds of tasks."""
-    from jumper_warp.cli import doctor, drive, export, info, list, sysid, train
+    from jumper_warp.cli import doctor, drive, export, info, list, sysid, train, watch
     from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
     from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
@@ -87,6 +87,7 @@ def settings_of(command: str) -> list[Any]:
     stock = stock_evaluations().values()
     return {
         "train": [train.TrainArgs],
+        "watch": [watch.WatchArgs],
         "finetune": [FinetuneArgs],
         "play": [*(PlayCfg(default_flags(each, "play")) for each in stock), ScriptCfg, DumpCfg],
         "drive": [drive.DriveCfg],

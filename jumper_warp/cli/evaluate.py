@@ -5,6 +5,7 @@ The policy comes first: its task decides which flags there are.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -104,7 +105,10 @@ def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = (
     with phase(f"opening {policy}"):
         from jumper_warp.evaluation.run import EvaluationRun
 
-        return EvaluationRun(policy, modules)
+        run = EvaluationRun(policy, modules)
+    if run.policy.checkpoint is not None:
+        print(f"checkpoint: {run.policy.checkpoint}", file=sys.stderr)
+    return run
 
 
 def parse(command: Literal["evaluate", "play"], task: TaskCfg, args: Sequence[str], kind: Any) -> Any:

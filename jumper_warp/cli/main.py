@@ -30,6 +30,7 @@ INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent
 INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
+    "watch": "Show a training that runs or has ended: jumper watch RUN.",
     "finetune": "Reduce a jumping policy's errors by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "drive": "Drive a robot from the browser.",

@@ -24,6 +24,7 @@ from jumper_warp.utils.threads import checked_threads
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from jumper_warp.live.training import TrainingWatch
     from jumper_warp.recipe import Recipe
     from jumper_warp.rl.checkpoint import Checkpoint
     from jumper_warp.rl.run_folder import TrainResult
@@ -37,7 +38,7 @@ SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
 SHORT_HELP = (
     "preset", "num-envs", "max-iterations", "max-seconds", "seed", "randomize", "noise", "history", "solver", "robot",
     "resume", "init-policy", "trainer", "ppo.hidden", "ppo.lr", "ppo.entropy-coef", "device", "threads", "log-root",
-    "save-interval", "task-module",
+    "save-interval", "watch", "video-every", "task-module",
 )  # fmt: skip
 """Flags on the page of `jumper train --help`."""
 
@@ -62,6 +63,10 @@ class TrainArgs:
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""
+    watch: bool = False
+    """Show the training while it runs: robots, reward terms and learning curves. `jumper watch RUN` joins later."""
+    viewer: Literal["rerun", "viser"] = "rerun"  # Viewer of --watch: the Rerun viewer, or a page in the browser
+    video_every: int = 0  # Iterations between two films in the run's folder; 0: none
 
 
 def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
@@ -158,7 +163,7 @@ def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
     """Return the flags in unparsed arguments that a trainer does not use."""
     if trainer != "rsl-rl":
         return []
-    names = [name.replace("_", "-") for name in RSL_RL_UNUSED]
+    names = [name.replace("_", "-") for name in (*RSL_RL_UNUSED, "watch", "video-every")]
     flags = list_flags(TrainArgs, described=False)
     unused = {option for flag in flags if flag.name in names for option in flag.options}
     return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
@@ -224,6 +229,18 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     return shlex.join(["jumper", "train", *kept])
 
 
+def watches(args: Sequence[str]) -> list[TrainingWatch]:
+    """Return the observers that the flags --watch and --video-every in unparsed arguments ask for."""
+    watched = "--watch" in args
+    every = int((values_of("--video-every", args) or ["0"])[-1])
+    if not watched and every < 1:
+        return []
+    from jumper_warp.live.training import TrainingWatch
+
+    viewer: Any = (values_of("--viewer", args) or ["rerun"])[-1]
+    return [TrainingWatch(viewer if watched else "none", max(every, 0))]
+
+
 def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:
     """Print the expected duration of a training on a CPU, unless it is short.
 
@@ -270,8 +287,10 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
             rate = PRESET_STEPS_PER_SECOND
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
+    command = command_line(args, modules)
+    observers = watches(args) if is_rank_0 else []
     try:
-        result = train(recipe, checkpoints=checkpoints, command=command_line(args, modules), expected_rate=rate)
+        result = train(recipe, checkpoints=checkpoints, command=command, expected_rate=rate, observers=observers)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
             worlds = f"num_envs {cfg.num_envs} does not fit"

@@ -153,6 +153,8 @@ class Env(Stages):
         self._started = False
         self._compiled = False
         self._graphs = {}
+        self.step_hooks: list[Callable[[], None]] = []
+        """Functions that `step` calls last, also within a captured graph; they must not change the environment."""
         self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
@@ -261,6 +263,8 @@ class Env(Stages):
                 self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
         else:
             self._graphs[resets].replay()
+        for hook in self.step_hooks:
+            hook()
         return self._step
 
     def _launch_step(self, worlds: WorldRange | None = None) -> None:

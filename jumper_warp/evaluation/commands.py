@@ -8,8 +8,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
 
 import tyro
@@ -92,9 +94,16 @@ class FilmCfg:
     eye: tuple[float, float, float] | None = None
     """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side). It
     also sets the direction of the picture."""
+    angle_of_view: float | None = None
+    """[deg] Vertical angle of view of film and picture (default: the film's 30, the picture's 16)."""
+    true_scale: bool = False
+    """Draw all moments of the picture at their true places, also of a robot that stays in place."""
+    title: str | None = None  # Title of film and picture (default: policy and task)
 
     def __post_init__(self) -> None:
         """Raise InputError for a vertical view or invalid film settings, before anything is simulated."""
+        if self.angle_of_view is not None and not 1.0 <= self.angle_of_view <= 120.0:
+            raise InputError(f"angle_of_view must be in [1, 120] deg, got {self.angle_of_view:g}")
         if self.eye is not None:
             import numpy as np
 
@@ -106,12 +115,23 @@ class FilmCfg:
 
             check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
+    @property
+    def view(self) -> Json:
+        """Options of `write_film` and `write_picture` about the camera."""
+        angle = {} if self.angle_of_view is None else {"field_of_view": self.angle_of_view}
+        return {"eye": self.eye, **angle}
+
+    @property
+    def notes(self) -> Json:
+        """Metadata of the recording."""
+        return {} if self.title is None else {"title": self.title}
+
     def write(self, recording: Recording) -> Path:
         """Write a film of a recording to the path `video`, and return that path."""
         from jumper_warp.viz.film import write_film
 
         assert self.video is not None
-        return write_film(recording, self.video, size=self.size, fps=self.fps, speed=self.speed, eye=self.eye)
+        return write_film(recording, self.video, size=self.size, fps=self.fps, speed=self.speed, **self.view)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +144,8 @@ class RecordingCfg:
     """Film of the recording to write."""
     out: Path | None = None  # Folder for all results (default: outputs/play/<time>)
     viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer. It listens on this machine's loopback address only."""
+    """Show the simulation while it runs in Rerun's viewer, a window or a page in the browser. It listens on this
+    machine's loopback address only."""
     printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
     """Format of the printed results."""
 
@@ -137,11 +158,12 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
+    rewards: bool = False  # Record the task's reward terms too; their kernel is compiled at the first use
 
     def __post_init__(self) -> None:
         """Raise InputError for a length of the recording [s] out of range."""
-        if self.seconds is not None and not 0.02 <= self.seconds <= 600.0:
-            raise InputError(f"seconds must be in [0.02, 600], got {self.seconds}")
+        if self.seconds is not None and not 0.02 <= self.seconds <= 3600.0:
+            raise InputError(f"seconds must be in [0.02, 3600], got {self.seconds}")
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
@@ -159,11 +181,12 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
     warn_beyond_training(run.task, log.all_commands())
-    env = run.env(log.count)
+    env = run.env(log.count, rewards=cfg.rewards)
     worlds = range(log.count)
-    notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver}
-    recorder = EnvRecorder(env, log, worlds, notes=notes)
+    notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver, **cfg.film.notes}
     seconds = cfg.seconds or flags.length
+    live = Live(seconds) if cfg.viewer == "rerun" else None
+    recorder = EnvRecorder(env, log, worlds, notes=notes, live=live and live.recording)
     stop = cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
     columns = log.columns()
@@ -172,7 +195,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     report = write_metrics(run.folder, columns)
     count = len(next(iter(columns.values())))
     words = f"{count} {log.row_name}{'s' * (count > 1)}"
-    return show_recording(run, report, recorder.recording(), log.row_name, cfg, words, log.main_columns or columns)
+    keys = log.main_columns or columns
+    return show_recording(run, report, recorder.recording(), log.row_name, cfg, words, keys, live)
 
 
 def played_name(source: str | Path) -> str:
@@ -211,8 +235,9 @@ def play_script(cfg: ScriptCfg) -> Path:
     course = CourseLog([script])
     course.warn_beyond_training(run.tasks)
     env = run.env(1, block=course.block)
-    notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
-    recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)
+    notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver, **cfg.film.notes}
+    live = Live(course.seconds) if cfg.viewer == "rerun" else None
+    recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes, live=live and live.recording)
     run_evaluation(run.actor(env), env, course, on_step=recorder)
     plot_course(run.folder / "timeline.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
@@ -221,24 +246,50 @@ def play_script(cfg: ScriptCfg) -> Path:
         key for key in SCRIPT_SUMMARY if not isinstance(metrics[key], MetricValue) or metrics[key].value is not None
     ]
     words = f"{len(script)} command{'s' * (len(script) > 1)} of {cfg.script}"
-    return show_recording(run, report, recorder.recording(), "course", cfg, words, defined)
+    return show_recording(run, report, recorder.recording(), "course", cfg, words, defined, live)
+
+
+class Live:
+    """Viewer that shows a recording while it grows; `recording` is its Rerun stream."""
+
+    def __init__(self, seconds: float) -> None:
+        """Start a server and, if there is a display, a window of the viewer; seconds: expected length [s]."""
+        from jumper_warp.viz.live_recording import LiveRecording
+        from jumper_warp.viz.rerun_server import RerunServer, announce
+
+        self._server = RerunServer()
+        self._window = announce(self._server.url, self._server.page)
+        self.recording = LiveRecording(self._server.url, seconds)
+
+    def finish(self, recording: Recording) -> None:
+        """Complete the view of a recording, and wait until its window is closed, or for Ctrl-C in a terminal."""
+        self.recording.finish(recording)
+        if self._window is not None:
+            self._window.wait()
+        elif sys.stderr.isatty():
+            print("Ctrl-C ends the view", file=sys.stderr)
+            with suppress(KeyboardInterrupt):
+                Event().wait()
+        self._server.close()
 
 
 def show_recording(
-    run: Run, report: Report, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
-) -> Path:
+    run: Run, report: Report, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str],
+    live: Live | None = None,
+) -> Path:  # fmt: skip
     """Write a recording (.rrd, picture, film if requested), print a summary, and return the path of the .rrd file.
 
-    It opens the viewer that `cfg` names. report: written metrics of the run. name: of the files and of a trial; count,
-    keys: number of trials and main metrics, for the summary.
+    report: written metrics of the run. name: of the files and of a trial; count, keys: number of trials and main
+    metrics, for the summary. live: viewer that shows the recording, for whose end this waits.
     """
     from jumper_warp.evaluation.recorder import save_recording
 
-    path = save_recording(recording, run.folder, name, cfg.film.eye)
+    path = save_recording(recording, run.folder, name, true_scale=cfg.film.true_scale, **cfg.film.view)
     films = [] if cfg.film.video is None else [cfg.film.write(recording)]
     run.print_flags = cfg.printing
     run.summarise(report, count, keys, trial=name, films=films)
-    open_viewer(path, cfg.viewer)
+    if live is not None:
+        live.finish(recording)
     return path
 
 
@@ -287,19 +338,8 @@ def play_dump(cfg: DumpCfg) -> Path:
         bad = np.array(found.names[name])[~np.isfinite(found.arrays[name])]
         print(f"{name} that are not finite: {', '.join(bad) or 'none'}")
     print(path)
-    open_viewer(path, cfg.viewer)
-    return path
+    if cfg.viewer == "rerun":
+        from jumper_warp.viz.rerun_server import viewer_command
 
-
-def open_viewer(path: Path, viewer: str) -> None:
-    """Open a recording in the viewer of this name, `rerun` or `none`."""
-    if viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
-
-
-def viewer_command(path: Path) -> list[str]:
-    """Return the command that opens a recording in the Rerun viewer, listening on loopback only.
-
-    Python must not import a `rerun.py` of the working directory (-P).
-    """
-    return [sys.executable, "-P", "-m", "rerun", str(path), "--bind", "127.0.0.1"]
+    return path

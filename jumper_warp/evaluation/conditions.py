@@ -149,18 +149,20 @@ def env_of_recipe(
     conditions: Conditions,
     *,
     change: Callable[[TaskCfg], TaskCfg] | None = None,
+    rewards: bool = False,
     **scene: Any,
 ) -> Env:
     """Return the environment of a recipe's task in the given test conditions.
 
-    It has no rewards, no critic observation, and events only if randomised.
-    change: returns a modified task before the conditions are applied. scene: further arguments of `Env`.
+    It has no critic observation, and events only if randomised.
+    change: returns a modified task before the conditions are applied. rewards: whether it has the task's rewards.
+    scene: further arguments of `Env`.
     Raises PolicyError: an event is needed, and its function was not found.
     """
     from jumper_warp.envs.env import Env
 
     try:
-        task = recipe.tested_task(conditions.randomize)
+        task = recipe.tested_task(conditions.randomize, rewards)
     except TaskError as error:
         raise PolicyError(str(error)) from error
     task = conditions.applied(task if change is None else change(task))

@@ -126,7 +126,11 @@ class EpisodeLog(EvaluationLog):
         """Return values to plot: base height and horizontal distance from the start [m] of all worlds."""
         pos = self.arrays["base_pos"]
         distance = np.linalg.norm((pos - self.start_position)[:, :2], axis=1)
-        return {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
+        series = {"height/base, {} [m]": pos[:, 2], "distance/from start, {} [m]": distance}
+        for label, values in zip(command_labels(self.task), self.commands.T, strict=False):
+            name, _, unit = label.partition(" [")
+            series[f"command/command {name}, {{}} [{unit or '1]'}"] = values
+        return series
 
     def labels(self, worlds: Sequence[int]) -> list[str]:
         """Return titles of some worlds, such as "episode 1, x 0.6 m, y 0 m", or "episode 1, command 0.6 0"."""
@@ -151,6 +155,11 @@ def command_columns(task: TaskCfg) -> list[str]:
     """Return the names of the values of a task's command as columns, such as `command_x_m`; `command_0` if unnamed."""
     words = [re.sub(r"\W+", "_", label.removesuffix(" [1]")).strip("_") for label in task.command.labels]
     return [f"command_{word}" for word in words or range(MAX_COMMAND_SIZE)]
+
+
+def command_labels(task: TaskCfg) -> tuple[str, ...]:
+    """Return the labels of the values of a task's command, such as `x [m]`; numbers if they have none."""
+    return task.command.labels or tuple(map(str, range(MAX_COMMAND_SIZE)))
 
 
 def command_text(task: TaskCfg, command: np.ndarray) -> str:

@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
+from jumper_warp.sim.simulation import motor_values
 from jumper_warp.utils.progress import phase
-from jumper_warp.utils.rotations import rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
     from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.robot.grounds import BlockCfg
     from jumper_warp.sim.simulation import Simulation
+    from jumper_warp.viz.live_recording import LiveRecording
     from jumper_warp.viz.recording import Recording
 
 SHOWN = 0.7  # [1] Position of the world to show in the picture among the recorded ones, which are ordered by goal
@@ -38,16 +40,19 @@ class EnvRecorder:
         ground: Any = "plane",
         block: BlockCfg | None = None,
         notes: Mapping[str, Any] | None = None,
+        live: LiveRecording | None = None,
     ) -> None:
         """Prepare an empty recording of worlds (indices, at least one) of the environment.
 
         log: supplies series, states, commands, labels and goals; ground: as in `build_model`; block: the environment's
-        sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log.
+        sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log. live: viewer that
+        shows the frames while they are recorded.
         """
         from jumper_warp.robot.model import build_model
         from jumper_warp.viz.recorder import Recorder
 
         self.env = env
+        self.live = live
         self.log = log
         self.worlds = list(worlds)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
@@ -64,38 +69,87 @@ class EnvRecorder:
         sim = self.env.sim
         log = self.log
         poses = sim.links()[0][self.worlds]
+        series = log.named(log.series(), self.worlds) | self._base_series() | self._motor_series() | self._task_series()
         forces = peak_forces(sim)[self.worlds]
         if self.block is not None:
             self.block_positions.append(block_positions(sim)[self.worlds])
         self.frames += 1
-        series = log.named(log.series(), self.worlds) | self._motor_series()
         self.recorder.record(
             self.frames * self.env.step_dt,
             poses.reshape(-1, 7),
             series,
             ankles(poses),
             forces,
-            states=log.named(log.states(), self.worlds),
+            states=log.named(log.states() | self._terminations(), self.worlds),
             commands=self._marks().get("commands"),
         )
+        if self.live is not None:
+            self.live.update(self.recorder)
 
     def _marks(self) -> dict[str, np.ndarray]:
         """Return goals, heights and commands of the recorded worlds, which the log's `marks` gives."""
         return {name: values[self.worlds] for name, values in self.log.marks().items()}
 
     def _motor_series(self) -> dict[str, float]:
-        """Return paw forces, motor torques and actions of the first recorded world, to plot, by name of the series.
+        """Return paw forces, and values of each motor, of the first recorded world, to plot, by name of the series.
 
-        Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
+        Largest force [N] on each paw in any physics step of the policy step; torque [N m], angle [rad], rate [rad/s]
+        and action [1] of each motor.
         """
         world = self.worlds[0]
         sim = self.env.sim
         peak = sim.peak_paw_force.numpy()[:, world]
-        torque = sim.torque.numpy()[:, world]
-        action = self.env.action[world].cpu().numpy()
         series = {f"peak paw force/{leg} [N]": peak[i] for i, leg in enumerate(LEGS)}
-        series |= {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
-        return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
+        values = {
+            "torque/{} [N m]": sim.torque.numpy()[:, world],
+            "angle/{} [rad]": motor_values(sim.joint_q()[world, 7:]),
+            "rate/{} [rad/s]": motor_values(sim.joint_qd()[world, 6:]),
+            "action/{} [1]": self.env.action[world].cpu().numpy(),
+        }
+        return series | {
+            key.format(name): each[i] for key, each in values.items() for i, name in enumerate(MOTOR_JOINTS)
+        }
+
+    def _base_series(self) -> dict[str, float]:
+        """Return velocity [m/s] and angular velocity [rad/s] of the first recorded world's base, body axes, to plot."""
+        world = self.worlds[0]
+        sim = self.env.sim
+        to_body = sim.joint_q()[world, 3:7] * CONJUGATE
+        linear = rotate(to_body, sim.base_velocity()[world])
+        angular = rotate(to_body, sim.joint_qd()[world, 3:6])
+        names = zip(("ahead", "left", "up"), linear, "xyz", angular, strict=True)
+        return {
+            key: value
+            for name, velocity, axis, rate in names
+            for key, value in (
+                (f"base velocity/{name} [m/s]", velocity), (f"base angular velocity/about {axis} [rad/s]", rate)
+            )
+        }  # fmt: skip
+
+    def _task_series(self) -> dict[str, float]:
+        """Return observations and reward terms of the first recorded world, to plot, by name of the series.
+
+        Observations are those of the newest policy step, as the policy reads them, in a group for each term; an
+        environment without rewards, or of several tasks, has none.
+        """
+        env = self.env
+        if len(env.tasks) > 1:
+            return {}
+        world = self.worlds[0]
+        row = env.obs[world].tolist()
+        values = {}
+        for term, (_, end) in zip(env.task.observations.actor, env.task.layout("actor").values(), strict=True):
+            names = term.columns[-term.width :]
+            for name, value in zip(names, row[end - term.width : end], strict=True):
+                values[f"observation {term.name}/{name.removeprefix(f'{term.name}_')} [1]"] = value
+        return values | {f"reward/{name} [1]": float(each[world]) for name, each in env.reward_terms.items()}
+
+    def _terminations(self) -> dict[str, np.ndarray]:
+        """Return the termination that ends each world's episode in this policy step, "none" in most, as a state."""
+        if len(self.env.tasks) > 1:
+            return {}
+        names = np.array([*self.env.task.termination_names, "none"])
+        return {"termination/{}": names[self.env.episodes.termination.numpy()]}
 
     def recording(self) -> Recording:
         """Return a recording of all frames so far, with the goals of the log and the blocks."""
@@ -109,17 +163,17 @@ class EnvRecorder:
         return with_blocks(recording, np.stack(self.block_positions), half, height)
 
 
-def save_recording(recording: Recording, folder: Path, name: str, eye: Sequence[float] | None = None) -> Path:
+def save_recording(recording: Recording, folder: Path, name: str, **picture: Any) -> Path:
     """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the .rrd path.
 
-    eye: direction of the picture's camera from the robot, as in `write_picture`.
+    picture: options of `write_picture`.
     """
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
     with phase(f"writing {name}.rrd"):
         path = write_rrd(recording, folder / f"{name}.rrd")
-    write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)), eye=eye)
+    write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)), **picture)
     return path
 
 

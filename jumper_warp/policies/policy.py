@@ -103,6 +103,7 @@ class Policy(nn.Module):
         """
         super().__init__()
         self.interface = interface
+        self.checkpoint: Path | None = None  # File of a training run from which the policy was loaded
         self.config = dict(config or {})
         tensors = {name: tensor.detach().float().cpu().clone() for name, tensor in _named(layers, mean, std).items()}
         check_tensors(tensors, interface)
@@ -229,7 +230,9 @@ def _policy_of_run(source: Path, newest: bool) -> Policy:
         path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
         state = checkpoints.load_checkpoint(path)
     try:
-        return read(state)
+        policy = read(state)
+        policy.checkpoint = path
+        return policy
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
     except TaskError as error:

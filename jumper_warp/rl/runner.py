@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from typing import Protocol
 
 import torch
 
@@ -21,6 +22,20 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.threads import set_threads
 
+
+class Observer(Protocol):
+    """Observer of trainings that run side by side; it must not change them."""
+
+    def begin(self, runs: Sequence[TrainingRun]) -> None:
+        """Prepare to observe runs, after their kernels are compiled and before their next iteration."""
+
+    def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
+        """Observe runs after each iteration, without waiting for the device."""
+
+    def end(self) -> None:
+        """Finish after the last iteration, or an error."""
+
+
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Function that makes an environment from the number of worlds, the seed and the device."""
 
@@ -28,13 +43,14 @@ MakeEnv = Callable[[int, int, torch.device], VecEnv]
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
     actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
+    observers: Sequence[Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy to the last iteration or the time limit, save a checkpoint, and return the result.
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
     checkpoint of cfg.resume (default: loaded here). expected_rate: usual environment steps per second of all worlds on
-    two CPU cores; one line warns of less than half of it (0: no warning).
+    two CPU cores; one line warns of less than half of it (0: no warning). observers: of the training, by trainer ppo.
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if a signal stopped the training (`StopRequest`),
@@ -58,7 +74,7 @@ def train(
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))
-        stop = iterate([run])
+        stop = iterate([run], observers=observers)
         distributed.wait_for_ranks()
         return finish(run.result(), [run], stop)
 
@@ -81,15 +97,20 @@ def prepare(
     return rank, checkpoints
 
 
-def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda: None) -> StopRequest:
+def iterate(
+    runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda: None, observers: Sequence[Observer] = ()
+) -> StopRequest:
     """Run trainings side by side, until the last iteration, the time limit or a stop request; return the latter.
 
-    on_logged: called after each iteration.
+    on_logged: called after each iteration. observers: of the trainings.
     """
     try:
         with StopRequest() as stop, ExitStack() as opened:
             for run in runs:
                 opened.enter_context(run.open())
+            for observer in observers:
+                opened.callback(observer.end)
+                observer.begin(runs)
             while active := [run for run in runs if not run.ended]:
                 for part in (TrainingRun.collect, TrainingRun.update):  # the same kernels of all runs fill a GPU best
                     for run in active:
@@ -101,6 +122,8 @@ def iterate(runs: Sequence[TrainingRun], on_logged: Callable[[], None] = lambda:
                     with run.stream:
                         run.conclude(stop, any(ends))
                 on_logged()
+                for observer in observers:
+                    observer.after_iteration(runs)
                 stop.can_abort = True
             return stop
     except Exception as error:

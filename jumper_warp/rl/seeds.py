@@ -24,7 +24,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import SeedsConsole
 from jumper_warp.rl.run_folder import TrainResult, new_folder
 from jumper_warp.rl.run_names import SEED
-from jumper_warp.rl.runner import MakeEnv, finish, iterate, leave_process_group, lock, prepare
+from jumper_warp.rl.runner import MakeEnv, Observer, finish, iterate, leave_process_group, lock, prepare
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
@@ -34,7 +34,7 @@ from jumper_warp.utils.runtime import DeviceStream
 
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, actor_init: ActorInit | None = None,
-    checkpoints: Sequence[Checkpoint] = (),
+    checkpoints: Sequence[Checkpoint] = (), observers: Sequence[Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy of each seed in cfg.seeds, save their checkpoints, and return the results.
 
@@ -70,7 +70,7 @@ def train(
                     with suppress(OSError):
                         (run.folder / resume.FROZEN).write_text(f"iteration {run.iteration}: {run.failure}\n")
 
-        stop = iterate(runs, after_iteration)
+        stop = iterate(runs, after_iteration, observers)
         results = {run.cfg.seed: run.result() for run in runs}
         hint = f", continue with: {runs[0].resume_command}" if stop.requested else ""
         lines = [f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}", *table(results, cfg.best_metric)]

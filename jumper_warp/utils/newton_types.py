@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         body_world: wp.array
         gravity: wp.array
         joint_armature: wp.array
+        joint_axis: wp.array
         joint_child: wp.array
         joint_damping: wp.array
         joint_f: wp.array
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
         joint_parent: wp.array
         joint_q: wp.array
         joint_qd: wp.array
+        joint_qd_start: wp.array
         joint_X_c: wp.array
         joint_X_p: wp.array
         shape_body: wp.array

@@ -20,7 +20,7 @@ from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
-from jumper_warp.viz.renderer import Line, View, open_renderer
+from jumper_warp.viz.renderer import FIELD_OF_VIEW, Line, View, open_renderer
 from jumper_warp.viz.scene import (
     ABOVE,
     REACH,
@@ -51,14 +51,16 @@ def write_film(
     fps: float = 30.0,
     speed: float = 1.0,
     eye: Sequence[float] | None = None,
+    field_of_view: float = FIELD_OF_VIEW,
     ranks: Sequence[int] | None = None,
 ) -> Path:
     """Write a film whose camera follows the robots; return its path. The suffix .mp4, .webp or .gif is the format.
 
     size: width and height [px], rounded up to even numbers. fps: frames per second of the film. speed: playback speed,
     0.25 for slow motion. eye: offset [m] of the camera from the robots' mean position, world frame (default: to their
-    right, at the least distance that shows all). ranks: indices in `recording.worlds`, shown side by side (default:
-    all). Raises InputError: see `check_film`, or too many frames for the format; OSError.
+    right, at the least distance that shows all). field_of_view: vertical angle of view [deg]. ranks: indices in
+    `recording.worlds`, shown side by side (default: all). Raises InputError: see `check_film`, or too many frames for
+    the format; OSError.
     """
     check_type("recording", recording, Recording)
     path = Path(path)
@@ -70,7 +72,7 @@ def write_film(
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
-    images = _images(recording, times, size, eye, ranks, path.name)
+    images = _images(recording, times, size, eye, field_of_view, ranks, path.name)
     if path.suffix != ".mp4":
         write_atomically(path, _encoded_animation(images, path.suffix[1:], fps, len(times)))
         return path
@@ -105,6 +107,7 @@ def _images(
     times: np.ndarray,
     size: tuple[int, int],
     eye: Sequence[float] | None,
+    field_of_view: float,
     ranks: Sequence[int],
     name: str,
 ) -> Iterator[Image.Image]:
@@ -116,7 +119,7 @@ def _images(
     seen = paths - targets[:, None]
     if len(recording.commands) or not recording.contact_forces.any():  # arrows; raised legs of a floating robot
         seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
-    frame_view = _view(seen, size, eye)
+    frame_view = _view(seen, size, eye, field_of_view)
     targets = _interpolated(recording, targets, times)
     bases = _interpolated(recording, paths, times)
     with (
@@ -124,7 +127,7 @@ def _images(
         phase(f"drawing {name} with {renderer.name}", len(times)) as advance,
     ):
         for i, (frame, time) in enumerate(zip(frames, times, strict=True)):
-            view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target)
+            view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target, field_of_view)
             image = renderer.draw(poses[i], view, _lines(recording, paths, bases[i], frame, ranks))
             named = zip(ranks, bases[i], strict=True) if len(ranks) > 1 else ()
             labels = [Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in named]
@@ -167,14 +170,16 @@ def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None) -> View:
+def _view(
+    paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None, field_of_view: float = FIELD_OF_VIEW
+) -> View:
     """Return the camera's view relative to its target: from `eye`, or one that always shows all robots.
 
     paths: base positions relative to the target [m], (num_frames, worlds, 3).
     """
     if eye is not None:
-        return View(np.asarray(eye, dtype=float), np.zeros(3))
-    return fit(corners(paths), np.array(DIRECTION), size)
+        return View(np.asarray(eye, dtype=float), np.zeros(3), field_of_view)
+    return fit(corners(paths), np.array(DIRECTION), size, field_of_view)
 
 
 def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:

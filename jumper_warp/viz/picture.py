@@ -103,12 +103,14 @@ class Composition:
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 
 
-def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = None) -> Composition:
+def compose(
+    recording: Recording, rank: int = 0, eye: Sequence[float] | None = None, true_scale: bool = False
+) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
     The moments of a robot that moves by less than STAYS, or DRIFT a hop, across the picture are drawn spread to the
-    right, unless it has a goal farther than GAP from its start. eye: as in `write_picture`. Frames after `valid_frames`
-    are ignored. Raises InputError: no frame remains.
+    right, unless it has a goal farther than GAP from its start. eye, true_scale: as in `write_picture`. Frames after
+    `valid_frames` are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -123,7 +125,7 @@ def compose(recording: Recording, rank: int = 0, eye: Sequence[float] | None = N
     flights = _flights(recording, rank)
     across = None if eye is None else np.array([-eye[1], eye[0], 0.0]) / np.hypot(eye[0], eye[1])
     widths = np.linalg.norm(offsets, axis=1) if across is None else np.abs(offsets @ across[:2])
-    stays = bool(widths[0] < max(STAYS, DRIFT * len(flights)) and not (widths[1:] > GAP).any())
+    stays = not true_scale and bool(widths[0] < max(STAYS, DRIFT * len(flights)) and not (widths[1:] > GAP).any())
     right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
     if stays and across is not None:
         right = across
@@ -215,20 +217,26 @@ def write_picture(
     width: int = WIDTH,
     eye: Sequence[float] | None = None,
     title: str | None = None,
+    true_scale: bool = False,
+    field_of_view: float = FIELD_OF_VIEW,
 ) -> Path:
     """Write a composite picture (.png, .webp or .jpg) of one world of a recording; return its path.
 
     rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. eye: direction of
     the camera from the robot, world frame, of any length (default: from the right of the path). title: default: task
-    and name of the world. Raises InputError: another suffix or width, or a vertical view; OSError.
+    and name of the world. true_scale: draw all moments at their true places, also of a robot that stays in place, where
+    they hide each other. field_of_view: vertical angle of view [deg]; a larger one shows more perspective.
+    Raises InputError: another suffix, width or angle, or a vertical view; OSError.
     """
     check_type("recording", recording, Recording)
     path = Path(path)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
         raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")
-    scene = compose(recording, rank, eye)
+    if not 1.0 <= field_of_view <= 120.0:
+        raise InputError(f"the angle of view must be in 1 to 120 deg, got {field_of_view:g}")
+    scene = compose(recording, rank, eye, true_scale)
     direction = scene.toward_eye + [0.0, 0.0, ELEVATION] if eye is None else np.array(eye, dtype=float)
-    view, size = _framed(_extent(scene), direction, width)
+    view, size = _framed(_extent(scene), direction, width, field_of_view)
     poses = recording.body_poses(rank)[scene.frames].astype(float)
     poses[..., :3] += scene.shift[:, None, None] * scene.right
     with (
@@ -281,18 +289,20 @@ def _extent(scene: Composition) -> np.ndarray:
     )
 
 
-def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View, tuple[int, int]]:
+def _framed(
+    points: np.ndarray, direction: np.ndarray, width: int, field_of_view: float
+) -> tuple[View, tuple[int, int]]:
     """Return the view from a direction that shows all points, and the image size [px], as high as necessary.
 
     A first view in the highest image measures how high the content is.
     """
     size = (width, HEIGHTS[1] * width // WIDTH)
-    pixels = fit(points, direction, size, FIELD_OF_VIEW).project(points, size)
+    pixels = fit(points, direction, size, field_of_view).project(points, size)
     needed = float(np.ptp(pixels[:, 1]) / np.ptp(pixels[:, 0])) * width
     least, most = (limit * width // WIDTH for limit in HEIGHTS)
     height = min(max(round(needed + 0.04 * width), least), most)
     size = (width, height + height % 2)
-    return fit(points, direction, size, FIELD_OF_VIEW), size
+    return fit(points, direction, size, field_of_view), size
 
 
 def _shapes(scene: Composition) -> list[ShapeMesh]:

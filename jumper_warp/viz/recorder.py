@@ -69,7 +69,8 @@ class Recorder:
         self._labels = tuple(labels)
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
-        self._series: dict[str, list[float]] | None = None
+        self._names_of_series: list[str] = []
+        self._series: list[np.ndarray] = []  # values of each frame; arrays, since an hour has 216,000
         self._contacts: list[tuple[np.ndarray, np.ndarray]] = []
         self._states: list[dict[str, str]] = []
         self._commands: list[np.ndarray] = []
@@ -114,19 +115,22 @@ class Recorder:
         if rows is not None:
             self._commands.append(rows.copy())
 
+    @property
+    def frames(self) -> int:
+        """Number of recorded frames."""
+        return len(self._times)
+
     def _append_series(self, series: Mapping[str, float]) -> None:
         """Append a frame's values of the series, by name. Raises InputError: a malformed, new or missing name."""
-        values = {name: float(value) for name, value in series.items()}
-        if self._series is None:
+        if not self._series:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
             if malformed:
                 raise InputError(f"series are named 'group/quantity [unit]', got {malformed[0]!r}")
-            self._series = {name: [] for name in series}
-        different = set(values) ^ set(self._series)
+            self._names_of_series = list(series)
+        different = set(series) ^ set(self._names_of_series)
         if different:
             raise InputError(f"every frame needs the same series; new or missing: {sorted(different)}")
-        for name, value in values.items():
-            self._series[name].append(value)
+        self._series.append(np.array([float(series[name]) for name in self._names_of_series]))
 
     def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Check and copy a frame's contacts, (num_worlds, contacts_per_world, 3) each; no contacts if both are None.
@@ -148,29 +152,33 @@ class Recorder:
             raise InputError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
         return points, forces
 
-    def recording(self, *, goals: np.ndarray | None = None, heights: np.ndarray | None = None) -> Recording:
-        """Return a recording of all frames recorded so far. Raises InputError: there is no frame.
+    def recording(
+        self, *, goals: np.ndarray | None = None, heights: np.ndarray | None = None, first: int = 0
+    ) -> Recording:
+        """Return a recording of all frames recorded so far, from frame `first` on. Raises InputError: there is none.
 
         goals [m]: on the ground, world frame, (worlds, goals, 3); heights [m]: commanded, (worlds,); NaN: none.
         """
-        if not self._times:
+        if not self._times[first:]:
             raise InputError("the recording has no frames")
+        series = np.stack(self._series[first:], axis=1)
+        commands = self._commands[first:] or None
         return Recording(
-            times=np.array(self._times),
+            times=np.array(self._times[first:]),
             worlds=self._worlds,
             bodies=self._names,
-            poses=np.stack(self._poses),
-            series={name: np.array(values) for name, values in (self._series or {}).items()},
-            contact_points=np.stack([points for points, _ in self._contacts]),
-            contact_forces=np.stack([forces for _, forces in self._contacts]),
+            poses=np.stack(self._poses[first:]),
+            series=dict(zip(self._names_of_series, series, strict=True)),
+            contact_points=np.stack([points for points, _ in self._contacts[first:]]),
+            contact_forces=np.stack([forces for _, forces in self._contacts[first:]]),
             spacing=self._spacing,
             shapes=self._shapes,
             notes=self._notes,
             labels=self._labels,
-            states={name: [frame[name] for frame in self._states] for name in self._states[0]},
+            states={name: [frame[name] for frame in self._states[first:]] for name in self._states[0]},
             **{
                 name: np.asarray(values, dtype=np.float32)
-                for name, values in (("goals", goals), ("heights", heights), ("commands", self._commands or None))
+                for name, values in (("goals", goals), ("heights", heights), ("commands", commands))
                 if values is not None
             },
         )

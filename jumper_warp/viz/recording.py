@@ -68,7 +68,9 @@ class Recording:
         return self.labels[rank] if self.labels else f"world_{self.worlds[rank]}"
 
     def heading(self, ranks: Sequence[int]) -> str:
-        """Return the title of a picture or film: policy and task from `notes`, and the world if it is only one."""
+        """Return the title of a picture or film: that in `notes`, else policy and task, and the world if only one."""
+        if "title" in self.notes:
+            return str(self.notes["title"])
         policy, task = (str(self.notes.get(key, "")) for key in ("policy", "task"))
         same = not policy or policy.replace("_", "-") == task
         words = [

@@ -15,11 +15,11 @@ No viewer is started and no port is opened.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,6 +39,7 @@ TRAIL_WIDTH = 1.5  # [px]
 LINE_WIDTHS = (1.0, 2.0)  # [px] of commanded and of all other curves
 EYE_DIRECTION = np.array([0.70, 0.63, 0.336])  # from the target of the view to the eye, world frame; a unit vector
 EYE_DISTANCE = 1.8  # [m] smallest distance of the eye from its target
+PLAIN = 3  # Groups of series that are always visible; others are in tabs
 LEGEND_SHARE = 0.35  # free time axis behind the curves, where the legend is, over the recording's length
 LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
 """Pattern of the name of a quantity of one leg: leg, motor if any, unit in brackets."""
@@ -55,27 +56,36 @@ def write_rrd(recording: Recording, path: Path) -> Path:
     check_type("recording", recording, Recording)
     stream = rr.RecordingStream("jumper-warp")
     memory = stream.memory_recording()
-    writer = _Writer(rr, stream, recording)
-    stream.send_blueprint(_blueprint(recording), make_active=False, make_default=True)
-    writer.log_scene()
-    for rank in range(len(recording.worlds)):
-        writer.log_world(rank)
-    writer.log_series()
-    writer.log_states()
+    stream.send_blueprint(blueprint(recording), make_active=False, make_default=True)
+    RecordingWriter(rr, stream, recording).write()
     write_atomically(Path(path), memory.drain_as_bytes())
     return Path(path)
 
 
-class _Writer:
+class RecordingWriter:
     """Writer of one recording to a Rerun stream, with one call for all frames of an entity."""
 
-    def __init__(self, rr: ModuleType, stream: Any, recording: Recording) -> None:
-        """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`."""
+    def __init__(
+        self, rr: ModuleType, stream: Any, recording: Recording, *, static: bool = True, first: int = 0
+    ) -> None:
+        """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`.
+
+        static: whether to write what does not change over time. first: first frame to write.
+        """
         self.rr = rr
         self.stream = stream
         self.recording = recording
+        self.static = static
+        self.first = first
         self.worlds = _world_names(recording)
-        self.times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
+
+    def write(self) -> None:
+        """Write scene, worlds, series and states."""
+        self.log_scene()
+        for rank in range(len(self.recording.worlds)):
+            self.log_world(rank)
+        self.log_series()
+        self.log_states()
 
     def log_scene(self) -> None:
         """Log the scene: all shapes once, and over time the poses of all bodies and the camera's target."""
@@ -84,7 +94,7 @@ class _Writer:
         for body in recording.bodies:
             world, link = body.split("/")
             parents.append(["scene", self.worlds[recording.worlds.index(int(world.removeprefix("world_")))], link])
-        self.stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._log(["scene"], rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for shape in (*recording.shapes, *goal_shapes(recording)):
             parent = ["scene"] if shape.body < 0 else parents[shape.body]
             mesh = rr.Mesh3D(
@@ -93,16 +103,16 @@ class _Writer:
                 triangle_indices=shape.triangles,
                 albedo_factor=[*_rgb([shape.color])[0], 255],
             )
-            self.stream.log(rr.new_entity_path([*parent, shape.name]), mesh, static=True)
+            self._log([*parent, shape.name], mesh)
         for index, parent in enumerate(parents):
-            pos, quat = np.split(recording.poses[:, index], [3], axis=1)
+            pos, quat = np.split(recording.poses[self.first :, index], [3], axis=1)
             self._send(parent, rr.Transform3D.columns(translation=pos, quaternion=quat))
         # The viewer puts the eye at 1.5 times the radius of the tracked entity: an invisible one, without area, sets it
         target, distance = view_targets(recording)
         ends = np.outer([-1.0, 1.0], [distance / 1.5, 0.0, 0.0])
         flat = rr.Mesh3D(vertex_positions=ends, triangle_indices=[[0, 0, 1]])
-        self.stream.log("scene/view_target", flat, static=True)
-        self._send(["scene", "view_target"], rr.Transform3D.columns(translation=target))
+        self._log(["scene", "view_target"], flat)
+        self._send(["scene", "view_target"], rr.Transform3D.columns(translation=target[self.first :]))
 
     def log_world(self, rank: int) -> None:
         """Log position, trail, contact forces and velocities of the rank-th recorded world."""
@@ -110,7 +120,7 @@ class _Writer:
         recording = self.recording
         parent = ["scene", self.worlds[rank]]
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
-        self.stream.log(rr.new_entity_path(parent), offset, static=True)
+        self._log(parent, offset)
         points = recording.contact_points[:, rank]
         base = recording.body_poses(rank)[:, 0]
         colors = list(LEG_COLORS.values())  # four contact points are the paws
@@ -121,7 +131,7 @@ class _Writer:
             colors=_rgb([ACTUAL_COLOR, *colors]),
             radii=rr.Radius.ui_points(0.5 * TRAIL_WIDTH),
         )
-        self.stream.log(rr.new_entity_path([*parent, "trail"]), trail, static=True)
+        self._log([*parent, "trail"], trail)
         if len(colors):
             self._log_arrows(
                 [*parent, "contact_forces"], points, FORCE_SCALE * recording.contact_forces[:, rank], colors
@@ -138,7 +148,9 @@ class _Writer:
     ) -> None:
         """Log the same number of arrows in each frame; origins, vectors [m]: (frames, arrows, 3)."""
         style = self.rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=_rgb(colors))
-        self.stream.log(self.rr.new_entity_path(entity), style, static=True)
+        self._log(entity, style)
+        origins = origins[self.first :]
+        vectors = vectors[self.first :]
         columns = self.rr.Arrows3D.columns(origins=origins.reshape(-1, 3), vectors=vectors.reshape(-1, 3))
         self._send(entity, columns.partition([origins.shape[1]] * len(origins)))
 
@@ -148,20 +160,28 @@ class _Writer:
             style = self.rr.SeriesLines(
                 names=plot.names, colors=_rgb(plot.colors), widths=[plot.width] * len(plot.names)
             )
-            self.stream.log(self.rr.new_entity_path(plot.entity), style, static=True)
-            self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values))
+            self._log(plot.entity, style)
+            self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values[self.first :]))
 
     def log_states(self) -> None:
         """Log the states, as text, in the frames in which they change."""
         for name, words in self.recording.states.items():
-            changes = [i for i, word in enumerate(words) if i == 0 or word != words[i - 1]]
-            times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[changes])]
+            frames = range(self.first, len(words))
+            changes = [i for i in frames if i == self.first or words[i] != words[i - 1]]
             columns = self.rr.StateChange.columns(state=[words[i] for i in changes])
-            self.stream.send_columns(self.rr.new_entity_path(["states", *name.split("/", 1)]), times, columns)
+            self._send(["states", *name.split("/", 1)], columns, changes)
 
-    def _send(self, entity: list[str], columns: Any) -> None:
-        """Log an entity's values, one per frame of the recording."""
-        self.stream.send_columns(self.rr.new_entity_path(entity), self.times, columns)
+    def _log(self, entity: list[str], archetype: Any) -> None:
+        """Log what does not change over time."""
+        if self.static:
+            self.stream.log(self.rr.new_entity_path(entity), archetype, static=True)
+
+    def _send(self, entity: list[str], columns: Any, frames: Sequence[int] | None = None) -> None:
+        """Log an entity's values, one for each of some frames (default: all from the first one on)."""
+        frames = range(self.first, len(self.recording.times)) if frames is None else frames
+        if len(frames):
+            times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[list(frames)])]
+            self.stream.send_columns(self.rr.new_entity_path(entity), times, columns)
 
 
 def _world_names(recording: Recording) -> list[str]:
@@ -261,16 +281,19 @@ def _curve(recording: Recording, group: str, quantity: str, values: np.ndarray) 
     return _Plot(group, quantity, [label], [color], LINE_WIDTHS[0 if commanded else 1], values[:, None], False)
 
 
-def _blueprint(recording: Recording) -> Any:
+def blueprint(
+    recording: Recording, seconds: float = 0.0, play_state: Literal["playing", "following"] = "playing"
+) -> Any:
     """Return the Rerun viewer's layout: scene and states on the left, plots on the right, motors in tabs.
 
-    The viewer plays in a loop from the beginning, with all panels collapsed.
+    The viewer plays in a loop from the beginning, with all panels collapsed. seconds: end of the time axis [s]
+    (default: the recording's). play_state: Rerun's, "following" for a recording that grows.
     """
     import rerun as rr
     import rerun.blueprint as rrb
 
     start = float(recording.times[0])
-    end = float(recording.times[-1])
+    end = max(float(recording.times[-1]), seconds)
     limits = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (start, end + LEGEND_SHARE * (end - start)))
     axis = rrb.TimeAxis(view_range=rr.TimeRange(*limits))
     left = [_scene_view(recording)]
@@ -282,10 +305,12 @@ def _blueprint(recording: Recording) -> Any:
     groups = {group: _group_views(group, plots, axis) for group, plots in _plots(recording).items()}
     plain = [views[0] for views in groups.values() if len(views) == 1]
     tabs = [rrb.Vertical(*views, name=group) for group, views in groups.items() if len(views) > 1]
+    tabs += plain[PLAIN:]
+    plain = plain[:PLAIN]
     if groups:
         shares = [1.0] * len(plain) + [3.0] * bool(tabs)
         columns.append(rrb.Vertical(*plain, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares))
-    panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all")
+    panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state=play_state, loop_mode="all")
     layout = rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)])
     return rrb.Blueprint(layout, panel, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 

@@ -1,15 +1,20 @@
 """Triangle meshes of the visible shapes of a Newton model."""
 
-from dataclasses import dataclass
-from typing import Any
+from __future__ import annotations
 
-import newton
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import trimesh
-from newton import GeoType
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.newton_types import Model
+
+if TYPE_CHECKING:  # viewers that receive meshes do not need it
+    import newton
+    from newton import GeoType
+
+    from jumper_warp.utils.newton_types import Model
 
 PLANE_EXTENT = 10.0  # [m] half the side of the square drawn for an infinite plane
 CHECKER_CELL = 0.5  # [m] side of one field of a drawn plane
@@ -33,6 +38,9 @@ def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
 
     worlds: indices in the model. Raises InputError: a visible shape of a kind that cannot be drawn (a cone or a splat).
     """
+    import newton
+    from newton import GeoType
+
     kinds = model.shape_type.numpy()
     scales = model.shape_scale.numpy().astype(float)
     placements = model.shape_transform.numpy().astype(float)
@@ -58,6 +66,8 @@ def _surface(kind: GeoType, scale: np.ndarray, source: Any, label: str) -> trime
 
     scale: Newton's three size parameters [m], or of a mesh [1]. source: mesh or heightfield. label: for the error.
     """
+    from newton import GeoType
+
     if kind == GeoType.SPHERE:
         return trimesh.creation.icosphere(subdivisions=3, radius=scale[0])
     if kind == GeoType.CAPSULE:

@@ -13,3 +13,7 @@ COMMAND_COLOR = (0.835, 0.369, 0.000)  # vermilion
 ACTUAL_COLOR = (0.000, 0.447, 0.698)  # blue
 GOAL_COLOR = COMMAND_COLOR  # a goal is a commanded place
 BASE_COLOR = (0.15, 0.15, 0.18)  # nearly black: the path of the base, and scales in pictures
+SERIES_COLORS = (
+    *LEG_COLORS.values(), (0.337, 0.706, 0.914), COMMAND_COLOR, (0.941, 0.894, 0.259), (0.5, 0.5, 0.5), BASE_COLOR,
+)  # fmt: skip
+"""Colors of many series, in order."""

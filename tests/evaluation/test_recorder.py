@@ -3,7 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hold_height import hold_height
 from jump_helpers import make_env, random_actions
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.episodes import EpisodeLog
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, ankles
@@ -58,7 +61,50 @@ def test_paw_forces_are_peaks_between_the_frames():
     last = np.linalg.norm(np.array(sampled_last), axis=1)
     assert (peaks >= last - 1e-3).all()
     assert (peaks > 2.0 * last + 50.0).any()  # [N] an impact is over before the frame
-    assert shown.labels == ("0.90 m",) and set(shown.states) == {"phase/0.90 m"}
+    assert shown.labels == ("0.90 m",) and set(shown.states) == {"phase/0.90 m", "termination/0.90 m"}
+
+
+def test_series_are_those_of_the_environment():
+    env = Env(hold_height(), 2, device="cpu", auto_reset=False)
+    log = EpisodeLog(np.array([[0.3], [0.35]]), env.task)
+    recorder = EnvRecorder(env, log, [1])
+    actions = iter(random_actions(2, 12))
+    rows = []
+
+    def on_step():
+        recorder()
+        view = env.sim.joint_q()[1], env.sim.joint_qd()[1], env.sim.base_velocity()[1]
+        rows.append(
+            (*(each.copy() for each in view), env.obs[1].numpy().copy(), env.reward_terms["near_goal"][1].item())
+        )
+
+    run_evaluation(lambda obs: next(actions), env, log, seconds=0.2, on_step=on_step, stop=False)
+    q, qd, velocity, obs, reward = map(np.array, zip(*rows, strict=True))
+    series = recorder.recording().series
+    np.testing.assert_allclose(series["angle/FR_lateral [rad]"], q[:, 12])
+    np.testing.assert_allclose(series["rate/FL_inner [rad/s]"], qd[:, 9])
+    np.testing.assert_allclose(series["reward/near_goal [1]"], reward)
+    speed = [series[f"base velocity/{name} [m/s]"] for name in ("ahead", "left", "up")]
+    np.testing.assert_allclose(np.linalg.norm(speed, axis=0), np.linalg.norm(velocity, axis=1), rtol=1e-5)
+    names = list(env.task.observation_names)
+    for name, column in (("wanted_height/wanted_height", "wanted_height"), ("height/height", "height"),
+                         ("gravity/z", "gravity_z"), ("angle/BR_outer", "angle_BR_outer")):  # fmt: skip
+        np.testing.assert_allclose(series[f"observation {name} [1]"], obs[:, names.index(column)])
+    (command,) = (values for name, values in series.items() if name.startswith("command/"))
+    np.testing.assert_allclose(command, 0.35)
+
+
+def test_a_recording_may_begin_at_any_frame():
+    env, log = make_env(1), JumpLog(np.array([0.9]), make_task("vertical-jump").termination_names)
+    recorder = EnvRecorder(env, log, [0])
+    actions = iter(random_actions(1, 6))
+    run_evaluation(lambda obs: next(actions), env, log, seconds=0.1, on_step=recorder, stop=False)
+    whole = recorder.recording()
+    part = recorder.recorder.recording(first=4)
+    assert part.times.tolist() == whole.times[4:].tolist()
+    assert np.array_equal(part.poses, whole.poses[4:])
+    assert all(np.array_equal(part.series[name], values[4:]) for name, values in whole.series.items())
+    assert part.states["phase/0.90 m"] == whole.states["phase/0.90 m"][4:]
 
 
 def test_goals_are_rings_of_the_tolerance_on_the_ground_spaced_by_world():

@@ -26,6 +26,9 @@ def with_jump_terminations(task: TaskCfg) -> TaskCfg:
 class JumpEvaluation(Evaluation):
     """Base class of the evaluations of jumps from rest in the default pose."""
 
+    goal_marker: ClassVar[str] = "goal"
+    """Field of the state that live views mark: the place and, if it is commanded, the height of the apex."""
+
     def prepare_task(self, task: TaskCfg) -> TaskCfg:
         """Return a copy of a task that keeps only the terminations for evaluated jumps."""
         return with_jump_terminations(task)

@@ -1,0 +1,126 @@
+"""Process that shows a training, and the bounded queue that feeds it; a slow or killed viewer delays nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jumper_warp.live.clips import Layout
+from jumper_warp.live.scene import RobotScene
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.rerun_server import is_served
+
+ADDRESS = "watch.txt"  # File in a run's folder with the address of its live view
+QUEUED = 8  # Largest number of iterations that wait for the viewer; older ones are dropped
+Viewer = Literal["rerun", "viser", "none"]
+PACKAGES = Path(__file__).parents[2]  # Folder that Python searches for this package
+
+
+class Steps(NamedTuple):
+    """Policy steps of an iteration of one run."""
+
+    run: int  # index in `Setup.folders`
+    number: int  # counts the iterations of this process
+    iteration: int  # of the training
+    words: np.ndarray  # (steps, slots, columns) int32, see `WorldBuffer`
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Everything that the viewer's process needs to know before the first policy step."""
+
+    folders: tuple[Path, ...]  # of the runs, one for each seed; their metrics files are read
+    titles: tuple[str, ...]  # of the runs
+    scene: RobotScene
+    layout: Layout
+    terms: tuple[str, ...]  # names of the reward terms
+    endings: tuple[str, ...]  # names of the terminations
+    state: np.dtype  # of the task's state
+    goal: str  # field of the state that is marked in the scene; empty: none
+    step_dt: float  # [s] policy step
+    elapsed: float  # [s] training time so far
+    viewer: Viewer = "rerun"
+    video_every: int = 0  # iterations between two films; 0: none
+    wandb: str | None = None  # project of Weights & Biases for the films
+
+    def __post_init__(self) -> None:
+        """Raise InputError: viser is asked for and not installed."""
+        if self.viewer == "viser" and find_spec("viser") is None:
+            raise InputError('--viewer viser needs viser: pip install "jumper-warp[drive]"')
+
+
+def write_address(folders: Sequence[Path], url: str, page: str) -> None:
+    """Write the addresses of a live view to the runs' folders, where `jumper watch` finds them."""
+    for folder in folders:
+        write_atomically(folder / ADDRESS, f"{url}\n{page}\n".encode())
+
+
+def live_address(run: Path) -> tuple[str, str] | None:
+    """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
+    files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
+    for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
+        url, page = file.read_text().splitlines()
+        if is_served(url):
+            return url, page
+    return None
+
+
+class Feed:
+    """Feed of a process of its own that runs a module of this package, such as the viewer."""
+
+    def __init__(self, setup: Any, module: str = "jumper_warp.live.viewer") -> None:
+        """Start the process, which does not receive this terminal's Ctrl-C; setup: first message, never dropped."""
+        command = [sys.executable, "-P", "-m", module]
+        path = os.pathsep.join(filter(None, (str(PACKAGES), os.environ.get("PYTHONPATH"))))
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, bufsize=0, start_new_session=True, env={**os.environ, "PYTHONPATH": path}
+        )
+        self._queue: deque[Any] = deque(maxlen=QUEUED)
+        self._ready = Event()
+        self._ending = False
+        self.broken = False  # Whether the process has ended
+        self._thread = Thread(target=self._send, args=(setup,), daemon=True)
+        self._thread.start()
+
+    def put(self, message: Any) -> None:
+        """Enqueue a message without waiting; it replaces the oldest one of a full queue."""
+        self._queue.append(message)
+        self._ready.set()
+
+    def close(self, seconds: float = 1.0) -> None:
+        """Close the process's input after the enqueued messages, and wait for that, at most some time [s]."""
+        self._ending = True
+        self._ready.set()
+        self._thread.join(seconds)
+
+    def _send(self, message: Any) -> None:
+        """Write messages to the process, in a thread of its own, until `close` or the end of the process."""
+        pipe = self.process.stdin
+        assert pipe is not None
+        try:
+            while True:
+                data = memoryview(pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL))
+                while data:
+                    data = data[pipe.write(data) :]
+                while not self._queue:
+                    if self._ending:
+                        return
+                    self._ready.wait()
+                    self._ready.clear()
+                message = self._queue.popleft()
+        except OSError:
+            self.broken = True
+        finally:
+            pipe.close()
