@@ -8,5 +8,9 @@ from setuptools import find_namespace_packages, setup
 setup(
     packages=[*find_namespace_packages(include=["jumper_warp*"]), "jumper_warp.assets"],
     package_dir={"jumper_warp.assets": "assets"},
-    package_data={"jumper_warp.assets": ["*/*", "*/*/*"], "jumper_warp.viz": ["*.mplstyle"], "jumper_warp.live": ["*.js"]},
+    package_data={
+        "jumper_warp.assets": ["*/*", "*/*/*"],
+        "jumper_warp.live": ["*.js"],
+        "jumper_warp.viz": ["*.mplstyle"],
+    },
 )
