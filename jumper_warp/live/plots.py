@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 SECONDS = 5.0  # [s] Time axis of the plots
 WIDTH = 300  # [px] Width of the panel of plots
+AXIS = 56  # [px] Width of the values beside a plot, such as -0.002
 TORQUE = "torque over limit"
 PLOTS = {
     "Motion": {"height": "height of the base [m]", "velocity": "velocity [m/s], [rad/s]"},
@@ -49,7 +50,7 @@ class Plots:
                     curves = self.curves(group)
                     self.plots[group] = server.gui.add_uplot(
                         tuple(curves.values()), series_of(curves), title=heading, height=230,
-                        scales={"x": {"time": False}}, legend={"live": False},
+                        scales={"x": {"time": False}}, axes=({}, {"size": AXIS}), legend={"live": False},
                     )  # fmt: skip
         with panel.add_tab("Reward"):
             self.bars = server.gui.add_html("")
