@@ -102,19 +102,19 @@ class AgentLog(EvaluationLog):
         return {}
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the last step's reward terms and the base's height."""
-        terms = {f"rewards/{term.name}, {{}} [1]": self._rewards[-1][:, i] for i, term in enumerate(self.task.rewards)}
-        return {"height/base, {} [m]": self.arrays["base_pos"][:, 2], **terms}
+        """Return the base's height; recordings have the reward terms of their first robot."""
+        return {"height/base, {} [m]": self.arrays["base_pos"][:, 2]}
 
 
 def actor(agent: str, env: Env, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return an agent's function from observations, which it ignores, to actions (num_envs, 12)."""
     import torch
 
+    from jumper_warp.sim.simulation import motor_values
+
     generator = np.random.default_rng(seed)
     held = torch.zeros(env.num_envs, 12, device=env.device)
     lateral, transversal = (math.radians(scale) for scale in env.task.action_scale)
-    columns = [7 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]  # of the motors, see `RobotArrays`
     first = np.ones(env.num_envs, dtype=bool)
 
     def act(_: torch.Tensor) -> torch.Tensor:
@@ -125,7 +125,7 @@ def actor(agent: str, env: Env, seed: int) -> Callable[[torch.Tensor], torch.Ten
         if agent == "hold":
             begun = np.flatnonzero((env.episodes.done.numpy() != 0.0) | first)
             first[:] = False
-            angles = env.sim.joint_q()[begun][:, columns] - env.robot.default_angle.numpy()
+            angles = motor_values(env.sim.joint_q()[begun][:, 7:]) - env.robot.default_angle.numpy()
             pose = angles / np.tile([lateral, transversal, transversal], 4)
             held[begun] = torch.from_numpy(pose.clip(-1.0, 1.0).astype(np.float32)).to(env.device)
         return held

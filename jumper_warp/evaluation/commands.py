@@ -338,8 +338,13 @@ def play_dump(cfg: DumpCfg) -> Path:
         bad = np.array(found.names[name])[~np.isfinite(found.arrays[name])]
         print(f"{name} that are not finite: {', '.join(bad) or 'none'}")
     print(path)
-    if cfg.viewer == "rerun":
+    open_viewer(path, cfg.viewer)
+    return path
+
+
+def open_viewer(path: Path, viewer: str) -> None:
+    """Open a recording in the viewer of this name, `rerun` or `none`."""
+    if viewer == "rerun":
         from jumper_warp.viz.rerun_server import viewer_command
 
         subprocess.run(viewer_command(path), check=False)
-    return path
