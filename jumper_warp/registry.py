@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import keyword
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.utils.assets import dashed, policy_tasks
-from jumper_warp.utils.checks import NAME, check_flags
+from jumper_warp.utils.checks import NAME, check_flags, check_type
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import existing_file
 from jumper_warp.utils.sources import PROJECT_PREFIX, module_from_file, own_fault
@@ -197,6 +198,16 @@ def register_task(
     always replaces its task. Raises InputError: a name or alias is taken or invalid, or make is no function.
     """
     check_flags(replace=replace)
+    check_type("ppo", ppo, PpoCfg | None)
+    check_type("about", about, str)
+    check_type("aliases", aliases, tuple[str, ...])
+    check_type("presets", presets, dict[str, str] | None)
+    for preset, flags in (presets or {}).items():
+        check_type(f"preset {preset!r:.40}", flags, str)
+        try:
+            shlex.split(flags)
+        except ValueError as error:
+            raise InputError(f"preset {preset!r:.40} of task {name!r:.40}: {error}") from error
     if not callable(make) or not all(isinstance(each, str) and NAME.fullmatch(each) for each in (name, *aliases)):
         given = f"{name!r:.40}, {make!r:.60}, aliases {aliases!r:.60}"
         raise InputError(f"register_task needs names as for files, and a function that makes the task, got {given}")

@@ -214,8 +214,10 @@ class Env(Stages):
 
         Where the mask is not 0, a step ignores the action and begins a new episode; it counts in no metric, and
         `reward`, `done` and the like keep their values. Call this before the first reset.
-        Raises InputError (a ValueError): the environment has several tasks.
+        Raises InputError (a ValueError): the environment has several tasks, or was reset already.
         """
+        if self._started:
+            raise InputError("use_reset_mask must be called before the first reset")
         if len(self.tasks) > 1:
             raise InputError(f"a reset mask needs an environment of one task, this one has {len(self.tasks)}")
         self._reset_mask = wp.zeros(self.num_envs, dtype=float, device=self.wp_device)
@@ -284,7 +286,8 @@ class Env(Stages):
     def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
         """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
 
-        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
+        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range. Raises
+        InputError (a ValueError): a range beyond the worlds.
         """
         part = self._part(worlds)
         return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance_physics(part),

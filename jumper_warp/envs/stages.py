@@ -32,7 +32,7 @@ from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
-from jumper_warp.sim.dynamics import WorldRange
+from jumper_warp.sim.dynamics import WorldRange, check_worlds
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
@@ -135,7 +135,8 @@ class Stages(Uncopied):
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""
-        if worlds is None or worlds.count == self.num_envs:
+        worlds = check_worlds(worlds, self.num_envs)
+        if worlds.count == self.num_envs:
             return WorldSlice(0, self.num_envs, self.episodes)
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:

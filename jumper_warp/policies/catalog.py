@@ -170,7 +170,7 @@ def write_files(folder: Path, files: Mapping[str, bytes], old: Mapping[str, byte
     Raises PolicyError: a name is not that of a file in a folder. OSError: the disk is full or the folder cannot be
     written.
     """
-    if wrong := [name for name in files if not FILE_NAME.fullmatch(name)]:
+    if wrong := [name for name in files if not FILE_NAME.fullmatch(name) or name == MANIFEST]:
         raise PolicyError(f"{folder}: a policy cannot hold a file {wrong[0]!r:.60}")
     present = {name: hashlib.sha256(data).hexdigest() for name, data in old.items()}
     written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}

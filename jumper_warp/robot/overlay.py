@@ -82,6 +82,10 @@ class RobotOverlay:
     def __post_init__(self) -> None:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
         check_types("robot overlay", self)
+        for name in ("values", "randomization"):  # arrays become tuples, which JSON can hold
+            pairs = {key: tuple(np.asarray(row).tolist()) if np.ndim(row) == 1 else row
+                     for key, row in getattr(self, name).items()}  # fmt: skip
+            object.__setattr__(self, name, pairs)
         check_names("quantity", self.values, RANGES)
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))

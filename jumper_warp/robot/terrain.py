@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jumper_warp.robot.grounds import MOST_CELLS
 from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 
@@ -63,6 +64,9 @@ class TerrainCfg:
                 raise InputError(f"terrain {name} must be positive and finite, got {getattr(self, name)}")
         if self.start + self.rim >= 0.5 * self.tile or self.cell > 0.25 * self.start:
             raise InputError(f"terrain start, rim and cell must fit in a tile of {self.tile} m")
+        edge = (max(self.rows, len(self.kinds)) * self.tile + 2.0 * self.border) / self.cell
+        if edge > MOST_CELLS:
+            raise InputError(f"a terrain may have {MOST_CELLS} cells along an edge, got {edge:.0f}")
         if not 0.0 <= self.uneven < 1.0 or not 0.0 <= self.slope < 60.0:
             raise InputError(
                 f"terrain uneven must be in [0, 1) m, slope in [0, 60) deg, got {self.uneven}, {self.slope}"

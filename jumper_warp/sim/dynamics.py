@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from numbers import Integral
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -55,6 +56,16 @@ class WorldRange(NamedTuple):
 
     first: int
     count: int
+
+
+def check_worlds(worlds: WorldRange | None, num_worlds: int) -> WorldRange:
+    """Return a range of worlds, by default all. Raises InputError: it is no such range, empty, or beyond the worlds."""
+    if worlds is None:
+        return WorldRange(0, num_worlds)
+    whole = isinstance(worlds, WorldRange) and all(isinstance(number, Integral) for number in worlds)
+    if not whole or worlds.first < 0 or worlds.count < 1 or worlds.first + worlds.count > num_worlds:
+        raise InputError(f"worlds must be a WorldRange in {num_worlds} worlds, got {worlds!r:.60}")
+    return worlds
 
 
 def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:

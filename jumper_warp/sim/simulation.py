@@ -21,7 +21,15 @@ from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange, check_step, slices_of, warn_of_colliders
+from jumper_warp.sim.dynamics import (
+    TOLERANCE,
+    JumperDynamics,
+    WorldRange,
+    check_step,
+    check_worlds,
+    slices_of,
+    warn_of_colliders,
+)
 from jumper_warp.sim.mujoco import MujocoDynamics
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array
@@ -285,8 +293,12 @@ class Simulation(Uncopied):
 
         With delay [physics steps], (num_worlds,), they follow `previous` (12, num_worlds) until the target arrives.
         bodies: whether to write passive joints and bodies of the state. worlds: range to advance, by default all.
-        Raises InputError: substeps no whole number of at least 1, or arrays of another shape or type.
+        Raises InputError: substeps no whole number of at least 1, arrays of another shape or type, a delay without
+        `previous`, or a range beyond the worlds.
         """
+        check_worlds(worlds, self.num_worlds)
+        if delay is not None and previous is None:
+            raise InputError("a delay needs the previous target")
         substeps = check_count("substeps", substeps)
         n = self.num_worlds
         arrays = {"target": (target, (12, n)), "previous": (previous, (12, n)), "delay": (delay, (n,))}

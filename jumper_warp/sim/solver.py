@@ -16,7 +16,15 @@ from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, p
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
-from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, WorldRange, check_step, warn_of_colliders
+from jumper_warp.sim.dynamics import (
+    MAX_SWEEPS,
+    TOLERANCE,
+    JumperDynamics,
+    WorldRange,
+    check_step,
+    check_worlds,
+    warn_of_colliders,
+)
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
@@ -137,9 +145,7 @@ class SolverJumper(SolverBase):
         """
         self.validate_observables(observables, contacts)
         self._check_motors(motors, target=target, previous=previous, delay=delay)
-        first, count = worlds or (0, self.model.world_count)
-        if not 0 <= first <= first + count <= self.model.world_count:
-            raise InputError(f"worlds must be in a range of {self.model.world_count} worlds, got {worlds}")
+        check_worlds(worlds, self.model.world_count)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 

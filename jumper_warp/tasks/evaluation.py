@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import warp as wp
 
 from jumper_warp.tasks.copying import Struct
+from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 
 
@@ -48,6 +49,12 @@ class EpisodeMetric:
     field: str  # Field of the state, a float or an int
     statistic: Literal["mean", "max", "rate"] = "mean"
     """Statistic over episodes; rate: fraction of the episodes whose field is not 0."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for a text that is none, or another statistic."""
+        check_types("metric", self)
+        if self.statistic not in ("mean", "max", "rate"):
+            raise InputError(f"the statistic of a metric must be mean, max or rate, got {self.statistic!r:.40}")
 
 
 @dataclass(frozen=True)

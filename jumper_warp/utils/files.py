@@ -1,5 +1,6 @@
 """Atomic file writes, and bounded reading of regular files and of JSON."""
 
+import errno
 import itertools
 import json
 import math
@@ -43,8 +44,11 @@ def directory_lock(folder: Path) -> Iterator[int]:
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file atomically: readers see either the old or the new content, also after a power failure.
 
-    Raises OSError: the disk is full or the folder cannot be written; its `filename` is the path.
+    Raises OSError: the disk is full, the folder cannot be written, or the path is a device or a folder; its `filename`
+    is the path.
     """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     part = path.with_name(path.name + ".part")
     try:
         with directory_lock(path.parent) as directory:

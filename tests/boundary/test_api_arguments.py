@@ -24,12 +24,16 @@ from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.identification.motions import load_motions
 from jumper_warp.policies.catalog import ONNX, add_files
 from jumper_warp.policies.policy import save_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
 from jumper_warp.robot.motors import jumping_motors, walking_motors
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.terrain import TerrainCfg
+from jumper_warp.sim.dynamics import WorldRange
+from jumper_warp.tasks.cfg import ObservationsCfg
+from jumper_warp.tasks.evaluation import EpisodeMetric
 from jumper_warp.tasks.terms import StateMetric
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import POLICIES
@@ -108,6 +112,12 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: RslRlVecEnv(env, metrics_every=math.nan), "metrics_every"),
         (lambda env, model: RslRlVecEnv(env, metrics_every=1.5), "metrics_every"),
         (lambda env, model: RslRlVecEnv(env, max_episode_length="x"), "max_episode_length"),
+        (lambda env, model: env.stages(WorldRange(0, 10)), "worlds"),
+        (lambda env, model: env.stages(WorldRange(-1, 1)), "worlds"),
+        (lambda env, model: env.stages(WorldRange(0, 0)), "worlds"),
+        (lambda env, model: env.stages((0, 1)), "worlds"),
+        (lambda env, model: env.sim.advance(1, env.sim.target, worlds=WorldRange(1, 1)), "worlds"),
+        (lambda env, model: env.sim.advance(1, env.sim.target, delay=wp.zeros(1, dtype=int, device="cpu")), "delay"),
         (lambda env, model: env.task_arrays(1), "skill"),
         (lambda env, model: env.task_arrays(-1), "skill"),
         (lambda env, model: env.mirror("x"), "mirror"),
@@ -126,6 +136,15 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: Rollout(model, every=True), "every"),
         (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
         (lambda env, model: ClosedLoop(env, double="no"), "double"),
+        (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
+        (lambda env, model: ObservationsCfg((), ()), "actor"),
+        (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
+        (lambda env, model: TerrainCfg(rows=1_000_000), "10000 cells"),
+        (lambda env, model: register_task("x", lambda: None, about=3), "about"),
+        (lambda env, model: register_task("x", lambda: None, ppo={}), "ppo"),
+        (lambda env, model: register_task("x", lambda: None, aliases="abc"), "aliases"),
+        (lambda env, model: register_task("x", lambda: None, presets={"a": 3}), "preset 'a'"),
+        (lambda env, model: register_task("x", lambda: None, presets={"a": '--ppo.lr "x'}), "preset 'a'"),
         (lambda env, model: BlockCfg((0.9, 0.0), height="x"), "block height"),
         (lambda env, model: BlockCfg((0.9, 0.0), mass=math.inf), "block mass"),
         (lambda env, model: BlockCfg((0.9, 0.0), friction=math.inf), "block friction"),
@@ -356,3 +375,29 @@ def test_masked_readings_are_refused():
     policy = DeployedPolicy(POLICY / ONNX)
     with pytest.raises(InputError, match="angle must be numbers"):
         policy.filter_targets(ZEROS, np.ma.masked_array(ZEROS, mask=True), ZEROS)
+
+
+def test_a_reset_mask_after_the_first_reset_is_refused():
+    env = Env(make_task("vertical-jump"), 1, device="cpu")
+    env.reset()
+    with pytest.raises(InputError, match="before the first reset"):
+        env.use_reset_mask()
+
+
+def test_a_policy_keeps_its_manifest(tmp_path):
+    save_policy(tmp_path / "policy", load_policy("vertical_jump"))
+    with pytest.raises(PolicyError, match=r"cannot hold a file 'manifest\.json'"):
+        add_files(tmp_path / "policy", {"manifest.json": b"1"})
+    assert load_policy(tmp_path / "policy")
+
+
+def test_a_device_is_not_replaced_by_a_file():
+    with pytest.raises(OSError, match="not a regular file"):
+        RobotOverlay({}).save(Path("/dev/null"))
+    assert Path("/dev/null").is_char_device()
+
+
+def test_an_overlay_of_arrays_equals_one_of_tuples_and_can_be_saved(tmp_path):
+    overlay = RobotOverlay({"kp": np.full(12, 1.25, np.float32)}, {"gains": np.array([0.9, 1.1])})
+    assert overlay.to_json() == RobotOverlay({"kp": (1.25,) * 12}, {"gains": (0.9, 1.1)}).to_json()
+    overlay.save(tmp_path / "overlay.json")

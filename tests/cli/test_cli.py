@@ -50,7 +50,11 @@ def still(tmp_path_factory):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["fly"], "no command 'fly'; there are train, finetune, play, evaluate, export, sysid, list"),
+        (
+            ["fly"],
+            "no command 'fly'; there are train, watch, finetune, play, drive, evaluate, compare, try, sweep, "
+            "rescore, export, sysid, list",
+        ),
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),
         (["train", "--max-iterations", "3"], "the task comes first"),
