@@ -199,5 +199,5 @@ def _evaluate(
 
 
 def _with_terminations(test: TaskCfg, task: TaskCfg) -> TaskCfg:
-    """Return a task as it is evaluated, with the terminations of the task `test`."""
+    """Return a task for its evaluation, with the terminations of the task `test`."""
     return test.evaluation.prepare_task(dataclasses.replace(task, terminations=test.terminations))
