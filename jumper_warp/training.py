@@ -29,13 +29,16 @@ def train(
     seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
     (default: those that `recipe.train.resume` selects). on_iteration: called with the trainings of this process by seed
     after each iteration of several seeds; an exception ends them. command, expected_rate, observers: as in
-    `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, or has no
-    mirror image and a symmetric policy is requested; PolicyError or CheckpointError: `init_policy` cannot be used.
+    `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, has no
+    observation, or no mirror image although a symmetric policy is requested; PolicyError or CheckpointError:
+    `init_policy` cannot be used.
     """
     if not isinstance(recipe, Recipe):
         raise InputError(f"train needs a Recipe, such as Recipe.of(name), got {recipe!r:.60}")
     recipe.check_saving()
     cfg, task = recipe.train, recipe.task
+    if not task.observations.actor:
+        raise InputError(f"the policy of {task.name} has no observation")
     if seeds is not None:
         cfg = dataclasses.replace(cfg, seeds=tuple(seeds))
     if cfg.ppo.symmetry != "off":

@@ -183,7 +183,7 @@ def contents_of(task: TaskCfg) -> Json:
     """Return a task's observation and action sizes, observations, reward weights and terminations as JSON data."""
     return {
         "observation_sizes": {
-            group: max(end for _, end in task.layout(group).values()) for group in ("actor", "critic")
+            group: max((end for _, end in task.layout(group).values()), default=0) for group in ("actor", "critic")
         },
         "observations": [term.name for term in task.observations.actor],
         "action_size": 12,

@@ -143,11 +143,6 @@ class ObservationsCfg:
     actor: tuple[ObservationTerm, ...]
     critic: tuple[ObservationTerm, ...]
 
-    def __post_init__(self) -> None:
-        """Raise InputError: the policy observes nothing."""
-        if not self.actor:
-            raise InputError("observations: the actor needs at least one term")
-
 
 @dataclass(frozen=True)
 class TaskCfg(Copyable):

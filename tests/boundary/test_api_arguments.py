@@ -49,6 +49,7 @@ POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
 HEIGHT = make_task("vertical-jump").observations.actor[0]
 COMMAND = make_task("vertical-jump").command
+BLIND = dataclasses.replace(make_task("attitude"), observations=ObservationsCfg((), ()))  # a task without observation
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
         (lambda env, model: ClosedLoop(env, double="no"), "double"),
         (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
-        (lambda env, model: ObservationsCfg((), ()), "actor"),
+        (lambda env, model: train(Recipe(BLIND)), "no observation"),
         (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
         (lambda env, model: TerrainCfg(rows=1_000_000), "10000 cells"),
         (lambda env, model: register_task("x", lambda: None, about=3), "about"),
