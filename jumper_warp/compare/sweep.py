@@ -11,6 +11,7 @@ import shlex
 import socket
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -147,7 +148,10 @@ def _is_alive(attributes: Json, grace: float) -> bool:
     """Return whether the worker of a trial runs: its process on this host, else a sign within `grace` [s]."""
     host, _, process = attributes[WORKER].partition(":")
     if host == socket.gethostname():
-        return Path(f"/proc/{process}").exists()
+        with suppress(OSError):  # no such process
+            state = Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][0]
+            return state != "Z"  # a killed process whose parent has not asked for its end still has an entry
+        return False
     return time.time() - attributes[ALIVE] < grace
 
 
