@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from jumper_warp.policies.policy import actor_init_from_policy
@@ -16,19 +16,16 @@ from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     from jumper_warp.rl.checkpoint import Checkpoint
-    from jumper_warp.rl.training_run import TrainingRun
 
 
 def train(
     recipe: Recipe, *, seeds: Sequence[int] | None = None, checkpoints: Sequence[Checkpoint] = (),
     command: str | None = None, expected_rate: float = 0.0, observers: Sequence[runner.Observer] = (),
-    on_iteration: Callable[[dict[int, TrainingRun]], None] | None = None,
 ) -> TrainResult:  # fmt: skip
     """Train a policy, or one of each seed, save checkpoints in a new run's folder, and return the result.
 
     seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
-    (default: those that `recipe.train.resume` selects). on_iteration: called with the trainings of this process by seed
-    after each iteration of several seeds; an exception ends them. command, expected_rate, observers: as in
+    (default: those that `recipe.train.resume` selects). command, expected_rate, observers: as in
     `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, has no
     observation, or no mirror image although a symmetric policy is requested; PolicyError or CheckpointError:
     `init_policy` cannot be used.
@@ -49,7 +46,7 @@ def train(
     if cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     if cfg.seeds:
-        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers, on_iteration)
+        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
     checkpoint = checkpoints[0] if checkpoints else None
     return runner.train(
         cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate, observers

@@ -23,6 +23,7 @@ from jumper_warp.compare.training import train_arm
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
+from jumper_warp.rl.runner import Observer
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
@@ -155,6 +156,31 @@ def _is_alive(attributes: Json, grace: float) -> bool:
     return time.time() - attributes[ALIVE] < grace
 
 
+class TrialReport(Observer):
+    """Observer that reports the metric of a trial's seeds to the study, and ends a trial below the median."""
+
+    def __init__(self, trial: Any, sweep: Sweep) -> None:
+        """Report to a trial of Optuna."""
+        self._trial = trial
+        self._sweep = sweep
+        self._reported = 0  # Last reported iteration
+
+    def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
+        """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
+        from optuna.exceptions import TrialPruned
+
+        iteration = min(run.iteration for run in runs)
+        metric = self._sweep.metric
+        values = [run.metrics[metric] for run in runs if metric in run.metrics]
+        logged = iteration % runs[0].cfg.log_interval == 0 and len(values) == len(runs)
+        if logged and iteration > self._reported:
+            self._reported = iteration
+            self._trial.report(float(interquartile_mean(np.array(values))), iteration)
+            self._trial.set_user_attr(ALIVE, time.time())
+            if self._trial.should_prune():
+                raise TrialPruned(f"{self._trial.user_attrs[RUN]}: pruned at iteration {iteration}")
+
+
 def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe]) -> None:
     """Train the seeds of a trial, or continue its run, and save the result in the study."""
     from optuna.exceptions import TrialPruned
@@ -164,22 +190,8 @@ def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequenc
     trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}")
     trial.set_user_attr(ALIVE, time.time())
     trial.set_user_attr(RUN, run)
-    reported = [0]
-
-    def report(runs: dict[int, TrainingRun]) -> None:
-        """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
-        iteration = min(each.iteration for each in runs.values())
-        values = [each.metrics[sweep.metric] for each in runs.values() if sweep.metric in each.metrics]
-        due = iteration % next(iter(runs.values())).cfg.log_interval == 0
-        if due and len(values) == len(runs) and iteration > reported[0]:
-            reported[0] = iteration
-            trial.report(float(interquartile_mean(np.array(values))), iteration)
-            trial.set_user_attr(ALIVE, time.time())
-            if trial.should_prune():
-                raise TrialPruned(f"{run}: pruned at iteration {iteration}")
-
     try:
-        folder = train_arm(recipe_of(sweep.arguments(trial.params, run)), report)
+        folder = train_arm(recipe_of(sweep.arguments(trial.params, run)), [TrialReport(trial, sweep)])
     except TrialPruned as error:
         print(error)
         study.tell(trial, state=TrialState.PRUNED)

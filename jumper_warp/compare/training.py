@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 from jumper_warp.compare.arms import OF_A_SEED, differences
@@ -12,22 +12,22 @@ from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.resume import FROZEN, find_checkpoints, flat_settings
 from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, newest, seed_folders, title
-from jumper_warp.rl.training_run import TrainingRun
+from jumper_warp.rl.runner import Observer
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_json
 
 
-def train_arm(recipe: Recipe, on_iteration: Callable[[dict[int, TrainingRun]], None] | None = None) -> Path:
+def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     """Train the seeds of a recipe and return the run's folder; a run of the same `run_name` is continued.
 
-    on_iteration: see `jumper_warp.training.train`. Raises InputError: that run has other settings.
+    observers: see `jumper_warp.training.train`. Raises InputError: that run has other settings.
     """
     cfg = recipe.train
     runs = (folder for folder in (cfg.log_root / cfg.task).glob("*/") if title(folder) == cfg.run_name)
     run = newest(run for run in runs if any(run.glob(f"*/{CHECKPOINTS}/{MANIFEST}")))
     if run is None:
-        return train(recipe, on_iteration=on_iteration).folder
+        return train(recipe, observers=observers).folder
     folders = [folder for folder in seed_folders(run).values() if not (folder / FROZEN).exists()]
     saved = flat_settings(read_json(folders[0] / CONFIG, "settings of a run"))
     requested = {name: value for name, value in flat_settings(recipe.to_json()).items() if name not in OF_A_SEED}
@@ -37,4 +37,4 @@ def train_arm(recipe: Recipe, on_iteration: Callable[[dict[int, TrainingRun]], N
         return run
     resumed = dataclasses.replace(cfg, resume=str(run))
     checkpoints = find_checkpoints(resumed)
-    return train(dataclasses.replace(recipe, train=resumed), checkpoints=checkpoints, on_iteration=on_iteration).folder
+    return train(dataclasses.replace(recipe, train=resumed), checkpoints=checkpoints, observers=observers).folder

@@ -24,13 +24,13 @@ from jumper_warp.utils.threads import set_threads
 
 
 class Observer(Protocol):
-    """Observer of trainings that run side by side; it must not change them."""
+    """Observer of trainings that run side by side, which it must not change; subclasses inherit empty methods."""
 
     def begin(self, runs: Sequence[TrainingRun]) -> None:
         """Prepare to observe runs, after their kernels are compiled and before their next iteration."""
 
     def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
-        """Observe runs after each iteration, without waiting for the device."""
+        """Observe runs after each iteration, without waiting for the device. An exception ends the trainings."""
 
     def end(self) -> None:
         """Finish after the last iteration, or an error."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -35,14 +35,12 @@ from jumper_warp.utils.runtime import DeviceStream
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, actor_init: ActorInit | None = None,
     checkpoints: Sequence[Checkpoint] = (), observers: Sequence[Observer] = (),
-    on_iteration: Callable[[dict[int, TrainingRun]], None] | None = None,
 ) -> TrainResult:  # fmt: skip
     """Train a policy of each seed in cfg.seeds, save their checkpoints, and return the results.
 
     Under torchrun every process trains a part of the seeds, without the others. A seed whose training fails, since its
     weights are not finite, or a term with `stop_on_nan`, is frozen: the others continue, and a resume omits it.
-    checkpoints: one of each seed to continue from (default: those that cfg.resume selects). on_iteration: called with
-    the trainings by seed after each iteration; an exception ends them. Other arguments and errors:
+    checkpoints: one of each seed to continue from (default: those that cfg.resume selects). Other arguments and errors:
     see `jumper_warp.rl.runner.train`; a failure raises SystemExit if all seeds failed, except under torchrun.
     """
     with ExitStack() as cleanup:
@@ -71,8 +69,6 @@ def train(
                     run.log.print_line(f"frozen at iteration {run.iteration}: {run.failure}")
                     with suppress(OSError):
                         (run.folder / resume.FROZEN).write_text(f"iteration {run.iteration}: {run.failure}\n")
-            if on_iteration is not None:
-                on_iteration({run.cfg.seed: run for run in runs})
 
         stop = iterate(runs, after_iteration, observers)
         results = {run.cfg.seed: run.result() for run in runs}

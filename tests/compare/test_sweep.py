@@ -1,5 +1,7 @@
 import os
 import signal
+import socket
+import subprocess
 import time
 
 import pytest
@@ -74,14 +76,15 @@ def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
 def test_of_two_workers_one_is_killed_and_nothing_is_lost(tmp_path):
     """The killed worker's trial is continued from its checkpoint by the other one."""
     pytest.importorskip("submitit")
-    path = sweep_file(tmp_path, iterations=15, trials=3)
+    path = sweep_file(tmp_path, iterations=15, trials=3, more="pruning = false")
     sweep = read_sweep(path)
     jobs = submit(SweepCfg(path, workers=2, slurm=("timeout_min=10",)), sweep.folder)
     killed = None
     for _ in range(1200):
-        running = [trial for trial in open_study(sweep).get_trials() if len(trial.intermediate_values) > 2]
-        if running and killed is None:
-            killed = running[0]
+        running = open_study(sweep).get_trials(states=(optuna.trial.TrialState.RUNNING,))
+        begun = [trial for trial in running if len(trial.intermediate_values) > 2]
+        if begun and killed is None:
+            killed = begun[0]
             os.kill(int(killed.user_attrs[WORKER].partition(":")[2]), signal.SIGKILL)
         if states(sweep).count("COMPLETE") == 3:
             break
@@ -94,6 +97,21 @@ def test_of_two_workers_one_is_killed_and_nothing_is_lost(tmp_path):
     assert again.params == killed.params
     assert min(again.intermediate_values) > 1  # it did not begin from scratch
     assert len(list((sweep.folder / "vertical-jump").glob("*/"))) == 3
+
+
+def test_a_trial_of_a_killed_worker_is_queued_before_its_parent_asks_for_its_end(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    study = open_study(sweep)
+    with subprocess.Popen(["sleep", "100"]) as worker:
+        trial = study.ask(sweep.distributions())
+        for name, value in ((WORKER, f"{socket.gethostname()}:{worker.pid}"), (ALIVE, 0.0), (RUN, "trial_000")):
+            trial.set_user_attr(name, value)
+        requeue_abandoned(study, grace=0.0)
+        assert states(sweep) == ["RUNNING"]
+        worker.kill()
+        os.waitid(os.P_PID, worker.pid, os.WEXITED | os.WNOWAIT)  # until it is a zombie
+        requeue_abandoned(study, grace=0.0)
+        assert states(sweep) == ["FAIL", "WAITING"]
 
 
 def test_a_trial_of_another_host_is_queued_after_the_time_without_a_sign(tmp_path):

@@ -6,6 +6,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.cli.train import parse_train
 from jumper_warp.compare.training import train_arm
 from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.runner import Observer
 from jumper_warp.utils.errors import InputError
 
 SMALL = "--no-randomize --no-noise --history 1 --ppo.hidden 16 --num-envs 8 --log-interval 1 --save-interval 1"
@@ -29,18 +30,27 @@ def recipe(root, *flags):
     return parse_train(["vertical-jump", *arguments, *flags])[0]
 
 
-def test_a_finished_arm_is_kept_and_a_stopped_one_continues(tmp_path):
-    def stop(runs):
-        if runs[1].iteration == 2:
-            raise KeyboardInterrupt
+class Interruption(Observer):
+    """Observer that interrupts a training at an iteration, and notes the ones before."""
 
+    def __init__(self, iteration=None):
+        self.iteration = iteration
+        self.seen = []
+
+    def after_iteration(self, runs):
+        if runs[1].iteration == self.iteration:
+            raise KeyboardInterrupt
+        self.seen.append(runs[1].iteration)
+
+
+def test_a_finished_arm_is_kept_and_a_stopped_one_continues(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train_arm(recipe(tmp_path, "--max-iterations", "3"), stop)
-    iterations = []
-    folder = train_arm(recipe(tmp_path, "--max-iterations", "3"), lambda runs: iterations.append(runs[1].iteration))
-    assert iterations == [3]
+        train_arm(recipe(tmp_path, "--max-iterations", "3"), [Interruption(2)])
+    continued = Interruption()
+    folder = train_arm(recipe(tmp_path, "--max-iterations", "3"), [continued])
+    assert continued.seen == [3]
     assert last_metrics(folder / "seed_2")["iteration"] == 3
-    assert train_arm(recipe(tmp_path, "--max-iterations", "3"), lambda runs: pytest.fail("it trains")) == folder
+    assert train_arm(recipe(tmp_path, "--max-iterations", "3"), [Interruption(3)]) == folder  # it does not train
     assert len(list((tmp_path / "vertical-jump").iterdir())) == 1
 
 
