@@ -12,6 +12,7 @@ from types import ModuleType
 import tyro
 
 from jumper_warp.cli.main import parse
+from jumper_warp.rl.cfg import TrainCfg
 
 SECONDS = 10.0  # [s] Training time of each of the two trainings on a GPU
 SHARE = 8  # Divisor of a preset's iterations on a CPU
@@ -76,6 +77,8 @@ def short_flags(preset: str, cfg: TryCfg, cpu: bool) -> list[str]:
     if not cpu:
         return [*seeds, *(iterations or ["--max-seconds", str(SECONDS)]), *worlds]
     words = shlex.split(preset)
+    if "--max-iterations" not in words:
+        words += ["--max-iterations", str(TrainCfg.max_iterations)]
     place = words.index("--max-iterations")
     short = ["--max-iterations", str(int(words[place + 1]) // SHARE)]
     worlds = worlds or ["--num-envs", str(NUM_ENVS)]

@@ -48,7 +48,7 @@ class Take:
         return self.frames * self.step_dt < LONGEST
 
     def finish(self, report: Callable[[str, str], None]) -> None:
-        """Write the files in the background; report: called with a title and a text as they are complete."""
+        """Write the files in the background; report: called with title and text for each complete file."""
         page = self.serializer.as_html()
         threading.Thread(target=self._write, args=(page, report), daemon=True).start()
 

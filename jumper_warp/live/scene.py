@@ -1,6 +1,6 @@
 """Robot as live viewers draw it, without Newton: meshes of links, and the poses of links from joint coordinates.
 
-Any viewer can use it: the scene is pickled once to the viewer's process, which then receives joint coordinates only.
+Any viewer can use it: the scene is sent once to the viewer's process, which then receives joint coordinates only.
 """
 
 from __future__ import annotations

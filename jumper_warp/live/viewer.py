@@ -5,7 +5,6 @@ It imports neither PyTorch nor Warp, and ends with its input.
 
 from __future__ import annotations
 
-import pickle
 import sys
 import time
 from collections import deque
@@ -114,19 +113,19 @@ class Show:
             self._films.end()
 
 
-def read_messages(source: BinaryIO, inbox: deque[Any]) -> None:
+def read_messages(source: BinaryIO, inbox: deque[Steps | None]) -> None:
     """Append all messages of a stream to an inbox, then None."""
     try:
         while True:
-            inbox.append(pickle.load(source))
-    except (EOFError, OSError, pickle.UnpicklingError):
+            inbox.append(Steps.read(source))
+    except (EOFError, OSError):
         inbox.append(None)
 
 
 def main() -> None:
     """Show what the standard input brings, until it ends."""
     source = sys.stdin.buffer
-    setup: Setup = pickle.load(source)
+    setup = Setup.read(source)
     single = len(setup.folders) == 1
     runs = setup.titles[:SHOWN_RUNS]
     names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]
@@ -161,16 +160,16 @@ def open_view(setup: Setup, names: Sequence[str], cleanup: ExitStack) -> tuple[A
 
 def run(show: Show, source: BinaryIO, rate: float) -> None:
     """Show the messages of a stream until it ends; rate: of updates [1/s]."""
-    inbox: deque[Any] = deque(maxlen=64)
+    inbox: deque[Steps | None] = deque(maxlen=64)
     Thread(target=read_messages, args=(source, inbox), daemon=True).start()
     ended = False
     while not ended:
         started = time.monotonic()
         while inbox and not ended:
-            message = inbox.popleft()
-            ended = message is None
-            if not ended:
-                show.add(message)
+            if (steps := inbox.popleft()) is None:
+                ended = True
+            else:
+                show.add(steps)
         show.update()
         time.sleep(max(0.0, started + 1.0 / rate - time.monotonic()))
     show.end()

@@ -3,7 +3,6 @@
 A recording is self-contained: it can be drawn without the Newton model.
 """
 
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -13,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.utils.arrays import read_npz
+from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json, parse_json, write_atomically
-from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.utils.files import Json, parse_json
+from jumper_warp.viz.shapes import SURFACE, ShapeMesh, packed_shapes, unpacked_shapes
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
@@ -30,7 +29,6 @@ ARRAYS = (
     "commands",
 )  # fields of `Recording` that are arrays
 MOTION = "motion/"  # Begin of the names of the file's arrays that `Recording.motion` holds
-SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a dimensionless quantity is 1."""
@@ -94,13 +92,14 @@ class Recording:
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""
+        entries, meshes = packed_shapes(self.shapes)
         header = {
             "format": FORMAT,
             "version": VERSION,
             "worlds": self.worlds,
             "bodies": self.bodies,
             "series": list(self.series),
-            "shapes": [{"name": shape.name, "body": shape.body, "color": shape.color} for shape in self.shapes],
+            "shapes": entries,
             "spacing": self.spacing,
             "notes": self.notes,
             "labels": self.labels,
@@ -111,11 +110,7 @@ class Recording:
         series = np.array(list(self.series.values()), dtype=np.float64)
         arrays |= {MOTION + name: values for name, values in self.motion.items()}
         arrays["series"] = series.reshape(len(self.series), -1 if self.series else 0)
-        for index, shape in enumerate(self.shapes):
-            arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
-        data = io.BytesIO()
-        np.savez_compressed(data, **arrays)
-        write_atomically(Path(path), data.getvalue())
+        write_npz(Path(path), **arrays, **meshes)
         return Path(path)
 
 
@@ -141,19 +136,13 @@ def load_npz(path: Path) -> Recording:
 
 def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
     """Build a recording, without checks, from a NumPy archive; header: its decoded JSON entry `header`."""
-    shapes = tuple(
-        ShapeMesh(
-            shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)
-        )
-        for index, shape in enumerate(header["shapes"])
-    )
     return Recording(
         **{name: archive[name] for name in ARRAYS},
         worlds=tuple(header["worlds"]),
         bodies=tuple(header["bodies"]),
         series=dict(zip(header["series"], archive["series"], strict=True)),
         spacing=header["spacing"],
-        shapes=shapes,
+        shapes=unpacked_shapes(header["shapes"], archive),
         notes=header["notes"],
         labels=tuple(header["labels"]),
         states=header["states"],

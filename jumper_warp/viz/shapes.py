@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +11,7 @@ import numpy as np
 import trimesh
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:  # viewers that receive meshes do not need it
     import newton
@@ -31,6 +34,24 @@ class ShapeMesh:
     vertices: np.ndarray  # (num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world
     normals: np.ndarray  # (num_vertices, 3) float32, outward unit normals in the same frame
     triangles: np.ndarray  # (num_triangles, 3) int32, indices of vertices
+
+
+SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
+
+
+def packed_shapes(shapes: Iterable[ShapeMesh]) -> tuple[list[Json], dict[str, np.ndarray]]:
+    """Return shapes as JSON data, one entry for each, and their arrays by name, for `unpacked_shapes`."""
+    shapes = list(shapes)
+    entries: list[Json] = [{"name": shape.name, "body": shape.body, "color": shape.color} for shape in shapes]
+    arrays = {f"shape{i}_{part}": getattr(shape, part) for i, shape in enumerate(shapes) for part in SURFACE}
+    return entries, arrays
+
+
+def unpacked_shapes(entries: Iterable[Json], arrays: Mapping[str, np.ndarray]) -> tuple[ShapeMesh, ...]:
+    """Return the shapes that `packed_shapes` returned as entries and arrays. Raises LookupError: one is missing."""
+    surfaces = ([arrays[f"shape{i}_{part}"] for part in SURFACE] for i in itertools.count())
+    pairs = zip(entries, surfaces, strict=False)
+    return tuple(ShapeMesh(entry["name"], entry["body"], tuple(entry["color"]), *surface) for entry, surface in pairs)
 
 
 def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:

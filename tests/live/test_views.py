@@ -15,7 +15,7 @@ from jumper_warp.live.checkpoints import watch_checkpoints
 from jumper_warp.live.clips import ROLES
 from jumper_warp.live.curves import MetricsTail
 from jumper_warp.live.feed import live_address
-from jumper_warp.live.films import SIZE, Film, draw
+from jumper_warp.live.films import SIZE, draw, side_by_side
 from jumper_warp.live.rerun_view import RerunView
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
@@ -124,7 +124,10 @@ def test_watch_simulates_the_newest_checkpoint(tmp_path, capsys):
 def test_films_are_gifs_in_the_run_folder_and_in_tensorboard(sim, tmp_path):
     q = np.stack(12 * [sim.joint_q()])
     path = tmp_path / "videos" / "iteration_000100.gif"
-    draw(Film(path, 100, "run", robot_scene(sim.model), 1.0 / 60.0, q.astype(np.float32), None))
+    path.parent.mkdir()
+    recording = side_by_side(robot_scene(sim.model), q.astype(np.float32), 1.0 / 60.0)
+    draw(recording.save_npz(path.with_suffix(".npz")), 100)
+    assert not path.with_suffix(".npz").exists()
     with Image.open(path) as film:
         assert film.size == SIZE and film.n_frames > 1
     events = EventAccumulator(str(path.parent), size_guidance={"images": 0}).Reload()
