@@ -44,7 +44,6 @@ COMMANDS = {
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
     "doctor": "Check the installation: versions, and a step on each device.",
-    "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules), see MODULES."""
 MODULES = {"try": "try_task"}  # Module of `jumper_warp.cli` by command, where their names differ

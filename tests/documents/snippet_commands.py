@@ -144,7 +144,7 @@ class Commands:
                     )
                 if task and args[0] not in ("evaluate", "play"):
                     args = [args[0], "vertical_jump", *args[2:]]
-            settings = parsed(lambda: main(args)) if args[0] != "completion" else None
+            settings = parsed(lambda: main(args))
         self.check_values(settings)
         default = f"{args[1]}_finetuned" if args[0] == "finetune" else None
         if path := getattr(settings, "out", None) or default:
