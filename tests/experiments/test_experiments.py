@@ -140,12 +140,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_p
     ).run()
     saved = read_values(tmp_path)
     assert saved == reported
-    assert {
-        *HeightSweep.paper,
-        "success_rate",
-        "open_loop_apex_mean_m",
-        "pushed_in_flight_success_rate",
-    } <= saved.keys()
+    assert {*HeightSweep.paper, "success_rate", "open_loop_apex_mean_m"} <= saved.keys()
     assert 0.7 < saved["open_loop_apex_mean_m"] < 1.3 and saved["trained_range_m"] == [0.45, 1.15]
     assert saved["latency"].endswith(" ms") and 0.0 < saved["latency_ms"] < 17.0
     assert (saved["torque_limit_nm"], saved["randomize"]) == (18.0, True)
