@@ -102,8 +102,6 @@ def test_a_solver_steps_states_only(other, model):
             solver.step(*states, None, None, 0.002)
     with pytest.raises(InputError, match=r"^control\.joint_f must have shape"):
         solver.step(state, state, other or object(), None, 0.002)
-    with pytest.raises(InputError, match=r"^motors\.kp must have shape"):
-        solver.step_motors(state, state, other, None, 0.002, 1)
 
 
 @pytest.mark.parametrize(
