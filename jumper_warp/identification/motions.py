@@ -262,19 +262,9 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             raise InputError(f"{path} line {number}: expected {len(names)} values, found {len(row)}")
         try:
             columns.append([float(cell) if cell.strip() else math.nan for cell in row])
-        except ValueError:
-            raise InputError(f"{path} line {number}: expected numbers, found {first_non_number(row)!r:.40}") from None
+        except ValueError as error:
+            raise InputError(f"{path} line {number}: {error!s:.100}") from None
     return channels_of(path, names, np.array(columns)), sidecar_settings(path)
-
-
-def first_non_number(row: list[str]) -> str:
-    """Return the first cell of a CSV row that is neither a number nor empty; "" if there is none."""
-    for cell in row:
-        try:
-            float(cell or "nan")
-        except ValueError:
-            return cell
-    return ""
 
 
 def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
