@@ -14,7 +14,6 @@ import warp as wp
 
 from jumper_warp import Env, Recipe, Simulation, SolverJumper, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
-from jumper_warp.diff.closed_loop import ClosedLoop
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
@@ -74,7 +73,6 @@ def contacts_of(model):
         (GymEnv, "env"),
         (Sb3VecEnv, "envs"),
         (RslRlVecEnv, "env"),
-        (ClosedLoop, "env"),
         (Rollout, "model"),
         (SolverJumper, "model"),
         (Recorder, "model"),
@@ -136,7 +134,6 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: SolverJumper(model, dynamics=3), "dynamics"),
         (lambda env, model: Rollout(model, every=True), "every"),
         (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
-        (lambda env, model: ClosedLoop(env, double="no"), "double"),
         (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
         (lambda env, model: train(Recipe(BLIND)), "no observation"),
         (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
