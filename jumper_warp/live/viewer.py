@@ -125,7 +125,10 @@ def read_messages(source: BinaryIO, inbox: deque[Steps | None]) -> None:
 def main() -> None:
     """Show what the standard input brings, until it ends."""
     source = sys.stdin.buffer
-    setup = Setup.read(source)
+    try:
+        setup = Setup.read(source)
+    except EOFError:  # the sender has ended
+        return
     single = len(setup.folders) == 1
     runs = setup.titles[:SHOWN_RUNS]
     names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]

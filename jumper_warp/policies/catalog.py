@@ -106,7 +106,7 @@ def newest_run(source: str | Path) -> str | Path:
 def _no_policy(text: str, path: Path) -> str:
     """Return the error message for a name or path that is no policy: the task's policies, or similar names."""
     if path.is_file():
-        return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
+        return f"{path} is a file; give the folder of a policy or of a training run"
     if len(path.parts) > 1 or path.suffix:
         return f"{path}: no such folder (policy)"
     tasks = policy_tasks()

@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
@@ -154,6 +154,8 @@ def _fits(value: Any, hint: Any) -> bool:
     parts = get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return value in parts
     if origin is tuple:
         if isinstance(value, tuple) and parts[-1:] == (Ellipsis,):
             return all(_fits(part, parts[0]) for part in value)
@@ -172,6 +174,8 @@ def _shown(hint: Any) -> str:
     parts = get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(map(_shown, parts))
+    if origin is Literal:
+        return " or ".join(map(repr, parts))
     if origin is tuple:
         return f"({', '.join(map(_shown, parts))})"
     if origin is Sequence:
