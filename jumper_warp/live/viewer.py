@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from threading import Thread
 from typing import Any, BinaryIO
 
@@ -136,7 +136,8 @@ def main() -> None:
     with ExitStack() as cleanup:
         if setup.viewer != "none":
             view, url, page = open_view(setup, names, cleanup)
-            write_address(setup.folders, url, page)
+            with suppress(OSError):  # a full disk: the view can be opened, but not joined
+                write_address(setup.folders, url, page)
             announce(url, page)
         run(Show(setup, view), source, 8.0 if view is None else view.rate)
 

@@ -128,6 +128,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     Pictures may be missing. Raises PolicyError: another file is missing, one is truncated or altered, or the manifest
     is malformed or of another version.
     """
+    folder = Path(folder)
     path = folder / MANIFEST
     while True:
         data = read_file(path, PURPOSE, error=PolicyError)
@@ -187,6 +188,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
     Raises PolicyError: the folder is not an intact policy. OSError as `write_files`.
     """
+    folder = Path(folder)
     with directory_lock(folder.resolve().parent):
         write_files(folder, files, read_files(folder))
 
@@ -246,6 +248,7 @@ def summarise(folder: Path) -> PolicySummary:
 
     Raises PolicyError: it is no policy, or a file is missing, altered or malformed.
     """
+    folder = Path(folder)
     try:
         files = read_files(folder)
         interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG])["interface"])

@@ -175,7 +175,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("startup_trials = 2", "startup_trials = -1", "startup trials cannot be negative"),
         ("startup_trials = 2", "seed = -1", "Seed must be between"),
         ("startup_trials = 2", "grace = nan", "grace must be"),
-        ("startup_trials = 2", 'direction = "up"', "direction must be 'maximize' or 'minimize'"),
+        ("startup_trials = 2", 'direction = "up"', "direction must be maximize or minimize"),
         ("startup_trials = 2", 'name = "../up"', "name may contain"),
         ("sqlite", "sqlite:////none/none.db", "unable to open"),
         ("sqlite", "other", "Could not parse"),

@@ -122,11 +122,18 @@ def test_watch_simulates_the_newest_checkpoint(tmp_path, capsys):
     assert "iteration_000004.pt" in capsys.readouterr().err
 
 
-def test_watch_fails_with_the_process_of_its_viewer(tmp_path):
+def test_watch_fails_with_the_process_of_its_viewer(tmp_path, monkeypatch):
     folder = train(short_training(tmp_path)).folder
-    (folder / "watch.txt.part").mkdir()  # the address cannot be written
+    monkeypatch.setenv("PYTHONHOME", str(tmp_path))  # in which no Python starts
     with pytest.raises(InputError, match="the viewer's process ended with status 1"):
         watch_checkpoints(folder, "cpu", viewer="viser")
+
+
+def test_a_view_is_shown_if_its_address_cannot_be_saved(tmp_path, capfd):
+    folder = train(short_training(tmp_path)).folder
+    (folder / "watch.txt.part").mkdir()
+    watch_checkpoints(folder, "cpu", seconds=0.1, viewer="viser")
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_viewer_without_input_ends():
