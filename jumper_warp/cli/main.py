@@ -24,6 +24,7 @@ from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
 FAULT = 1  # Exit code for a fault of the program or the machine
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # Full disk, exhausted quota, too large file
 LEAST_COLUMNS = 20  # Smallest width of a terminal for which the output is laid out
 USAGE_ERROR = 2  # Exit code for input that cannot be used
 INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent with the data
@@ -227,11 +228,11 @@ def run_command(command: Callable[[], object]) -> None:
         raise SystemExit(USAGE_ERROR) from None
     except OSError as error:
         no_folder = "temporary directory" in str(error)  # of Python's tempfile, which names those that it tried
-        if error.filename is None and error.errno != errno.ENOSPC and not no_folder:
+        if error.filename is None and error.errno not in FULL and not no_folder:
             raise
         if error.filename is None and not no_folder:
             discard_output()
-        place = error.filename or ("TMPDIR" if no_folder else "standard output")
+        place = error.filename or ("TMPDIR" if no_folder else "standard output or an open file")
         print_error(f"{place}: {error.strerror}")
         raise SystemExit(USAGE_ERROR) from None
     except (MemoryError, RuntimeError) as error:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from jumper_warp.cli.compare import read_toml, with_tuples
+from jumper_warp.cli.compare import read_settings
 from jumper_warp.cli.main import parse
 from jumper_warp.registry import load_task_module
 from jumper_warp.utils.errors import InputError
@@ -89,10 +89,7 @@ def read_sweep(file: Path) -> Sweep:
     """Return the settings of a sweep, and load its files of tasks. Raises InputError: they are invalid."""
     from jumper_warp.compare.sweep import Sweep
 
-    try:
-        sweep = Sweep(**{"name": file.stem, **with_tuples(read_toml(file))})
-    except TypeError as error:
-        raise InputError(f"{file}: {error}") from error
+    sweep = read_settings(Sweep, file, name=file.stem)
     for module in sweep.modules:
         load_task_module(str(file.parent / module))
     return sweep

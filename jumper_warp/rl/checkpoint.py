@@ -71,7 +71,7 @@ def load_checkpoint(path: Path) -> Json:
 
     Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint.
     """
-    existing_file(path, PURPOSE, MAX_BYTES, CheckpointError)
+    path = existing_file(path, PURPOSE, MAX_BYTES, CheckpointError)
     entry = _read_manifest(path.parent).get(path.name)
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
@@ -104,6 +104,7 @@ def one_line_message(error: Exception) -> str:
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
     """Load and return the most recently saved usable checkpoint of a folder. Raises CheckpointError: there is none."""
+    folder = Path(folder)
     manifest = _read_manifest(folder)
     skipped: list[str] = []
     for name in reversed(manifest):
@@ -134,6 +135,7 @@ def best_checkpoint(folder: Path) -> Path:
 
     Raises CheckpointError: there is none.
     """
+    folder = Path(folder)
     return folder / (_best(_read_manifest(folder)) or newest_name(folder))
 
 

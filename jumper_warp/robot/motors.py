@@ -178,6 +178,7 @@ class LimitsCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError unless the limits are finite, lower < upper, and their hard zones do not overlap."""
+        check_types("angle", self)
         if not -FILTER_ANGLE <= self.lower < self.upper <= FILTER_ANGLE:
             allowed = f"within {FILTER_ANGLE:g} deg"
             raise InputError(f"lower limit must be below upper limit, {allowed}, got {self.lower}, {self.upper}")
@@ -201,6 +202,7 @@ class FilterCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if horizon or speed floor is out of its range."""
+        check_types("filter", self)
         check_bounds("filter", self, FILTER_BOUNDS)
 
 

@@ -16,7 +16,8 @@ from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, p
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, check_step, warn_of_colliders
-from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.checks import check_finite, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
@@ -219,8 +220,11 @@ class SolverJumper(SolverBase):
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Move the sliding blocks of some worlds (indices), by default all, to new start positions, at rest.
 
-        center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks.
+        center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks, or
+        unless they are finite numbers.
         """
+        center = real_array(center, "center")
+        check_finite("center", *center.ravel())
         values = self._block_values()
         values["start"][slice(None) if worlds is None else list(worlds)] = center
         self._blocks().assign(values)

@@ -64,8 +64,10 @@ def write_film(
     """
     check_type("recording", recording, Recording)
     path = Path(path)
-    size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    width, height = (pixels + pixels % 2 for pixels in size)
+    size = (width, height)
     check_film(path, size, fps, speed, eye)
+    View(np.array([1.0, 0.0, 0.0]), np.zeros(3), field_of_view).axes()
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
@@ -87,7 +89,8 @@ def write_film(
 
 def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye: Sequence[float] | None = None) -> None:
     """Raise InputError unless a film can be written with these arguments of `write_film`."""
-    check_type("size", size, Sequence[int])
+    path = Path(path)
+    check_type("size", tuple(size) if isinstance(size, Sequence) else size, tuple[int, int])
     check_type("fps", fps, float)
     check_type("speed", speed, float)
     if path.suffix not in SUFFIXES:

@@ -14,21 +14,23 @@ import warp as wp
 
 from jumper_warp import Env, Recipe, Simulation, SolverJumper, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
-from jumper_warp.diff.closed_loop import ClosedLoop
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.sb3 import Sb3VecEnv
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.identification.motions import load_motions
-from jumper_warp.policies.catalog import ONNX, add_files
-from jumper_warp.policies.policy import save_policy
+from jumper_warp.identification.actuators import Bench
+from jumper_warp.identification.motions import RecordedMotion, load_motions
+from jumper_warp.policies.catalog import ONNX, add_files, read_files, summarise
+from jumper_warp.policies.policy import blend, save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.robot.description import DEFAULT_DESCRIPTION, load_description
+from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
-from jumper_warp.robot.motors import jumping_motors, walking_motors
+from jumper_warp.robot.motors import LimitsCfg, jumping_motors, vertical_jump_filter, walking_motors
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.terrain import TerrainCfg
 from jumper_warp.sim.dynamics import WorldRange
@@ -47,6 +49,8 @@ from jumper_warp.viz.rerun import write_rrd
 
 POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
+SQUARE = np.zeros((12, 12))
+TIMES = np.arange(12.0)
 HEIGHT = make_task("vertical-jump").observations.actor[0]
 COMMAND = make_task("vertical-jump").command
 BLIND = dataclasses.replace(make_task("attitude"), observations=ObservationsCfg((), ()))  # a task without observation
@@ -62,6 +66,19 @@ def model():
     return build_model(1)
 
 
+def recorded(model):
+    """Return a recorder with two frames of a model of one world."""
+    recorder = Recorder(model)
+    recorder.record(0.0, model.body_q)
+    recorder.record(0.1, model.body_q)
+    return recorder
+
+
+def with_block():
+    """Return a solver of one world with a block."""
+    return SolverJumper(build_model(1), block=BlockCfg((0.9, 0.0)))
+
+
 def contacts_of(model):
     return newton.CollisionPipeline(model).contacts()
 
@@ -74,7 +91,6 @@ def contacts_of(model):
         (GymEnv, "env"),
         (Sb3VecEnv, "envs"),
         (RslRlVecEnv, "env"),
-        (ClosedLoop, "env"),
         (Rollout, "model"),
         (SolverJumper, "model"),
         (Recorder, "model"),
@@ -134,7 +150,6 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: SolverJumper(model, dynamics=3), "dynamics"),
         (lambda env, model: Rollout(model, every=True), "every"),
         (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
-        (lambda env, model: ClosedLoop(env, double="no"), "double"),
         (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
         (lambda env, model: train(Recipe(BLIND)), "no observation"),
         (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
@@ -213,11 +228,52 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: check_film(Path("x.gif"), (64, 64), "x", 1.0), "fps"),
         (lambda env, model: check_film(Path("x.gif"), (64, 64), 10.0, None), "speed"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, commands=ZEROS), "commands"),
+        (lambda env, model: recorded(model).recording(goals=ZEROS), "goals"),
+        (lambda env, model: recorded(model).recording(goals=np.zeros((5, 1, 3))), "goals"),
+        (lambda env, model: recorded(model).recording(goals=np.zeros((1, 1, 2))), "goals"),
+        (lambda env, model: recorded(model).recording(heights=ZEROS), "heights"),
+        (lambda env, model: recorded(model).save_picture("x.png", true_scale="no"), "true_scale"),
+        (lambda env, model: recorded(model).save_picture("x.png", width=300.5), "width"),
+        (lambda env, model: recorded(model).save_picture("x.png", title=3), "title"),
+        (lambda env, model: recorded(model).save_picture("x.png", eye=(1.0, 2.0)), "eye"),
+        (lambda env, model: recorded(model).save_picture("x.png", eye=(math.nan, 0.0, 0.0)), "eye"),
+        (lambda env, model: recorded(model).save_picture("x.png", field_of_view="x"), "field_of_view"),
+        (lambda env, model: write_film(recorded(model).recording(), "x.gif", eye=(0.0, math.nan, 1.0)), "eye"),
+        (lambda env, model: write_film(recorded(model).recording(), "x.gif", field_of_view=-5.0), "field_of_view"),
+        (lambda env, model: check_film("x.gif", (64, 64, 64), 10.0, 1.0), "size"),
+        (lambda env, model: export_robot("xml", Path("none")), "kind must be mjcf or urdf or usd"),
+        (lambda env, model: blend("vertical_jump", load_policy("vertical_jump"), 0.5), "policy must be"),
+        (lambda env, model: blend(load_policy("vertical_jump"), None, 0.5), "other must be"),
+        (lambda env, model: LimitsCfg(False, 90.0), "angle lower"),
+        (lambda env, model: LimitsCfg("0", 90.0), "angle lower"),
+        (lambda env, model: dataclasses.replace(vertical_jump_filter(), sum=(0.0, 90.0)), "filter sum"),
+        (lambda env, model: dataclasses.replace(vertical_jump_filter(), horizon=True), "filter horizon"),
+        (lambda env, model: with_block().place_blocks((math.nan, 0.0)), "center"),
+        (lambda env, model: with_block().place_blocks("x"), "center"),
+        (lambda env, model: RecordedMotion("x", TIMES, np.zeros((12, 12), bool)), "motion x: target"),
+        (lambda env, model: RecordedMotion("x", TIMES, "targets"), "motion x: target"),
+        (lambda env, model: RecordedMotion("x", TIMES, SQUARE, SQUARE + 1j), "motion x: angle"),
+        (lambda env, model: RecordedMotion("x", TIMES * 1.0e9, SQUARE, SQUARE), "time rises by 1e\\+09 s a row"),
+        (lambda env, model: Bench(*5 * [ZEROS > 0]), "bench: test"),
+        (lambda env, model: Bench(*5 * ["x"]), "bench: test"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).act(np.ones(147, dtype=bool)), "observation must be numbers"),
     ],
 )  # fmt: skip
 def test_an_argument_of_another_type_or_out_of_range_is_named(call, message, env, model):
     with pytest.raises(InputError, match=message):
         call(env, model)
+
+
+def test_a_path_may_be_a_text(tmp_path, model):
+    folder = str(save_policy(f"{tmp_path}/policy", load_policy("vertical_jump")))
+    add_files(folder, {"notes.txt": b"text"})
+    assert read_files(folder)["notes.txt"] == b"text"
+    assert summarise(folder) == summarise(Path(folder))
+    assert load_description(str(DEFAULT_DESCRIPTION)).urdf == load_description().urdf
+    assert export_robot("urdf", f"{tmp_path}/robot").is_file()
+    check_film("x.gif", (64, 64), 10.0, 1.0)
+    recorder = recorded(model)
+    assert load_npz(str(recorder.save_npz(f"{tmp_path}/x.npz"))).worlds == (0,)
 
 
 @pytest.mark.parametrize("name", [None, 1, [], np.zeros(2), b"vertical-jump"])

@@ -160,3 +160,31 @@ def test_wrong_files_are_refused(tmp_path):
     path.write_text("task = 'vertical-jump'\nnothing = 1")
     with pytest.raises(InputError, match="nothing"):
         read_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[1, 2]", "[]", "number of seeds"),
+        ("trials = 2", "trials = 0", "trials must be"),
+        ("{ low = 1, high = 3 }", "{ low = nan, high = 3.0 }", "ppo.epochs must be finite"),
+        ("{ low = 1, high = 3 }", "{ low = 1.0, high = inf }", "ppo.epochs must be finite"),
+        ("ppo.epochs", "seeds", "sets --seeds"),
+        ("--num-envs 8", "--run_name=x", "sets --run-name"),
+        ("--num-envs 8", "--num-envs '8", "No closing quotation"),
+        ("startup_trials = 2", "startup_trials = -1", "startup trials cannot be negative"),
+        ("startup_trials = 2", "seed = -1", "Seed must be between"),
+        ("startup_trials = 2", "grace = nan", "grace must be"),
+        ("startup_trials = 2", 'direction = "up"', "direction must be maximize or minimize"),
+        ("startup_trials = 2", 'name = "../up"', "name may contain"),
+        ("sqlite", "sqlite:////none/none.db", "unable to open"),
+        ("sqlite", "other", "Could not parse"),
+        ("Train/mean_episode_length", "Train/mean_episode", "has not logged Train/mean_episode at its end; it logged"),
+    ],
+)
+def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old, new, message):
+    path = sweep_file(tmp_path, iterations=1, trials=2)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SystemExit):
+        main(["sweep", str(path)])
+    assert message in capsys.readouterr().err

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jumper_warp.live.checkpoints import watch_checkpoints
 from jumper_warp.live.clips import ROLES
 from jumper_warp.live.curves import MetricsTail
-from jumper_warp.live.feed import live_address
+from jumper_warp.live.feed import live_address, start_module
 from jumper_warp.live.films import SIZE, draw, side_by_side
 from jumper_warp.live.rerun_view import RerunView
 from jumper_warp.live.scene import robot_scene
@@ -22,6 +22,7 @@ from jumper_warp.live.training import TrainingWatch
 from jumper_warp.live.viser_view import ViserView
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.training import train
+from jumper_warp.utils.errors import InputError
 from live_helpers import short_training
 
 TERMS = ("near_goal", "action_rate")
@@ -121,6 +122,31 @@ def test_watch_simulates_the_newest_checkpoint(tmp_path, capsys):
     assert "iteration_000004.pt" in capsys.readouterr().err
 
 
+def test_watch_fails_with_the_process_of_its_viewer(tmp_path, monkeypatch):
+    folder = train(short_training(tmp_path)).folder
+    monkeypatch.setenv("PYTHONHOME", str(tmp_path))  # in which no Python starts
+    with pytest.raises(InputError, match="the viewer's process ended with status 1"):
+        watch_checkpoints(folder, "cpu", viewer="viser")
+
+
+def test_a_view_is_shown_if_its_address_cannot_be_saved(tmp_path, capfd):
+    folder = train(short_training(tmp_path)).folder
+    (folder / "watch.txt.part").mkdir()
+    watch_checkpoints(folder, "cpu", seconds=0.1, viewer="viser")
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_viewer_without_input_ends():
+    process = start_module("jumper_warp.live.viewer")
+    assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"http://127.0.0.1:1\n", b"a\nb\n", b"http://127.0.0.1:99999/\nb\n", b"\xff"])
+def test_a_damaged_address_of_a_live_view_is_none(tmp_path, content):
+    (tmp_path / "watch.txt").write_bytes(content)
+    assert live_address(tmp_path) is None
+
+
 def test_films_are_gifs_in_the_run_folder_and_in_tensorboard(sim, tmp_path):
     q = np.stack(12 * [sim.joint_q()])
     path = tmp_path / "videos" / "iteration_000100.gif"
@@ -141,5 +167,5 @@ def test_tail_reads_complete_lines_once(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"iter')
     assert tail.lines() == [{"iteration": 1}]
     with (tmp_path / "metrics.jsonl").open("a") as file:
-        file.write('ation": 2}\n')
+        file.write('ation": 2}\nnull\n{"it\n')
     assert tail.lines() == [{"iteration": 2}]
