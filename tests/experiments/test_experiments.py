@@ -1,18 +1,16 @@
+import json
+
 import numpy as np
 import pytest
 
-from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, template
-from jumper_warp import make_task
+from experiments import benchmark_solver, benchmark_training, gradient_cost, learning_curves, new_reward, template
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.sweeps import HeightSweep
-from jumper_warp.recipe import Recipe
-from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
-from jumper_warp.training import train
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
 from metric_helpers import values
@@ -24,10 +22,22 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Folder of a short training."""
-    cfg = TrainCfg(num_envs=16, max_iterations=2, log_root=tmp_path_factory.mktemp("logs"), device="cpu",
-                   ppo=PpoCfg(num_steps=48), tensorboard=False)  # fmt: skip
-    return train(Recipe(make_task("vertical-jump"), cfg)).folder
+    """Folder, metrics and run of a short training with the reward of `new_reward.py`."""
+    folder = tmp_path_factory.mktemp("new_reward")
+    values = new_reward.main(new_reward.Args(num_envs=16, iterations=2, num_steps=48, out=folder, device="cpu"))
+    (run,) = (folder / "logs" / "vertical-jump").iterdir()
+    return folder, values, run
+
+
+# ---------------------------------------------------------------- a new reward
+
+
+def test_new_reward_is_logged_by_name(trained):
+    folder, values, run = trained
+    line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
+    assert values["episode_reward_even_load"] > 0.0
+    assert read_values(folder)["iterations"] == 2
 
 
 def test_template_measures_the_landing_error_over_friction(tmp_path):
@@ -126,7 +136,7 @@ def test_scripted_jump_reaches_open_loop_height_and_is_early_before_command(swee
 
 def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_path):
     reported = HeightSweep(
-        policy=str(trained), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
+        policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
     ).run()
     saved = read_values(tmp_path)
     assert saved == reported
