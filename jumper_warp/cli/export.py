@@ -48,7 +48,7 @@ def export(cfg: ExportCfg) -> Path:
     CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.catalog import is_run, newest_run, run_folder
-    from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, save_policy
+    from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
     source = Path(newest_run(cfg.source))
@@ -67,6 +67,8 @@ def export(cfg: ExportCfg) -> Path:
     if out.suffix == ".onnx":
         path = export_onnx(policy, out)
     else:
-        path = save_policy(out, policy, overwrite=cfg.overwrite)
+        curve = learning_curve(source) if trained else None
+        files = {} if curve is None else {"learning_curve.jsonl": curve}
+        path = save_policy(out, policy, files=files, overwrite=cfg.overwrite)
     print(path)
     return path

@@ -260,11 +260,26 @@ def summarise(folder: Path) -> PolicySummary:
         about = first_paragraph(read_file(readme, PURPOSE).decode()) if os.path.lexists(readme) else ""
         saved = parse_object(folder / METRICS, files[METRICS]) if METRICS in files else {"rows": []}
         rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
+        for row in rows:
+            _check_row(row)
         return PolicySummary(folder.resolve().name, folder, interface.task, about, len(files[ONNX]), rows)
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         message = f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run"
         raise PolicyError(message) from error
+
+
+def _check_row(row: Json) -> None:
+    """Raise PolicyError, or LookupError or such, unless metrics in one condition are as in docs/metrics.schema.json."""
+    metrics = row["metrics"].values()
+    shown = (*SUCCESSES, *ERRORS, "fall_rate")
+    numbers = [metric["value"] for key, metric in row["metrics"].items() if key in shown]
+    numbers += [metric["trials"] for metric in metrics]
+    texts = [metric["unit"] for metric in metrics]
+    valid = isinstance(row["condition"], str) and isinstance(row["conditions"], dict) and metrics
+    valid = valid and all(type(number) in (int, float, type(None)) for number in numbers)
+    if not valid or not all(isinstance(text, str | None) for text in texts):
+        raise PolicyError(f"{METRICS}: metrics of another type than docs/metrics.schema.json has")
 
 
 def first_paragraph(markdown: str) -> str:

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
@@ -31,6 +33,7 @@ from jumper_warp.policies.catalog import (
     newest_run,
     parse_object,
     read_files,
+    run_folder,
     write_files,
 )
 from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_onnx
@@ -40,6 +43,7 @@ from jumper_warp.rl import checkpoint as checkpoints
 from jumper_warp.rl.actor_init import ActorInit, make_actor_init, rescale_inputs
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
 from jumper_warp.rl.run_names import CHECKPOINTS
@@ -50,13 +54,23 @@ from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_json, write_atomically
+from jumper_warp.utils.files import Json, directory_lock, json_bytes, parse_json, read_file, read_json, write_atomically
 from jumper_warp.utils.normalise import normalise
 from jumper_warp.utils.runtime import source_versions
 
 FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
 RSL_RL_EPS = 0.01  # rsl-rl adds this to the standard deviation of observations
 RSL_RL_LIMIT = 1.0e6  # Bound of normalised observations, which rsl-rl does not clip
+CURVE = (
+    "iteration",
+    "Perf/elapsed_s",
+    "Train/mean_reward",
+    "Train/mean_episode_length",
+    "Metrics/success",
+    "Metrics/score",
+)
+"""Columns of a saved learning curve."""
+CURVE_ROWS = 60  # Maximum number of rows of a saved learning curve, evenly spaced
 
 
 class _Linear(nn.Linear):
@@ -287,6 +301,27 @@ def _actor_layers(model: Json, prefix: str) -> Weights:
     names = [key for key in model if key.startswith(prefix) and key.endswith(".weight")]
     names.sort(key=lambda key: int(key.split(".")[1]))
     return [(model[name], model[name.removesuffix("weight") + "bias"]) for name in names]
+
+
+def learning_curve(source: Path) -> bytes | None:
+    """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
+    path = run_folder(source) / METRICS_FILE
+    return thinned_curve(read_file(path, "metrics of a run")) if path.is_file() else None
+
+
+def thinned_curve(metrics: bytes) -> bytes:
+    """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
+
+    The lines are evenly spaced. The first and the last line are included, malformed lines are omitted.
+    """
+    rows = []
+    for line in metrics.splitlines():
+        with suppress(InputError, TypeError):
+            row = parse_json(line, METRICS_FILE)
+            rows.append({name: row[name] for name in CURVE if name in row})
+    last = len(rows) - 1
+    kept = rows if last < CURVE_ROWS else [rows[round(i * last / (CURVE_ROWS - 1))] for i in range(CURVE_ROWS)]
+    return "".join(f"{json.dumps(row)}\n" for row in kept).encode()
 
 
 # ---------------------------------------------------------------------- saving

@@ -4,13 +4,41 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from jumper_warp.utils.checks import check_types
+from jumper_warp.utils.checks import (
+    ACTIVATIONS,
+    MAX_HIDDEN,
+    MAX_WIDTH,
+    NAME,
+    check_angle_limits,
+    check_filter_speed,
+    check_types,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
+FULL_TURN = 2.0 * math.pi
+JOINT_BOUNDS = {
+    "action_scale": (1.0e-4, FULL_TURN),  # [rad]
+    "default_joint_pos": (-FULL_TURN, FULL_TURN),  # [rad]
+    "joint_stiffness": (0.0, 1.0e4),  # [N m/rad]
+    "joint_damping": (0.0, 1.0e3),  # [N m s/rad]
+    "torque_limit": (1.0e-3, 1.0e4),  # [N m]
+}
+"""Lower and upper bounds of the interface's fields with one value per joint."""
+SCALAR_BOUNDS = {
+    "policy_dt": (1.0e-4, 1.0),  # [s]
+    "physics_dt": (1.0e-6, 1.0),  # [s]
+    "observation_limit": (1.0e-3, 1.0e6),
+    "normalised_limit": (1.0e-3, 1.0e6),
+}
+"""Lower and upper bounds of the interface's scalar fields."""
+LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")  # Fields of each term in an observation layout
+FILTERED = ("lateral", "transversal", "sum")  # Angles with limits in a command filter: two motors, and outer + inner
+MAX_HISTORY = 1000  # Largest number of frames of an observation term
 METADATA_VERSION = 2  # Version of an ONNX file's metadata
 SOURCE_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
 
@@ -47,6 +75,34 @@ class PolicyInterface:
     normalised_limit: float = 10.0  # normalised observations are clamped to ± this many standard deviations
     quaternion_order: str = "xyzw"
 
+    def __post_init__(self) -> None:
+        """Raise PolicyError if a field is out of range, or fields contradict each other."""
+        for name in ("observation_names", "joint_names"):
+            names = getattr(self, name)
+            if not names or len(set(names)) < len(names):
+                raise PolicyError(f"{name} must be distinct, at least one")
+        for name in (self.task, *self.observation_names, *self.joint_names):
+            if not NAME.fullmatch(name):
+                raise PolicyError(f"names may contain letters, digits, _ . - and spaces, got {name!r:.60}")
+        for name, (low, high) in (JOINT_BOUNDS | SCALAR_BOUNDS).items():
+            values = getattr(self, name)
+            if name in JOINT_BOUNDS and len(values) != len(self.joint_names):
+                raise PolicyError(f"{name} needs {len(self.joint_names)} numbers, one per joint, got {len(values)}")
+            for value in values if name in JOINT_BOUNDS else (values,):
+                if not low <= value <= high:
+                    raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
+        if self.physics_dt > self.policy_dt:
+            raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
+            sizes = f"1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}"
+            raise PolicyError(f"hidden must name {sizes}, got {self.hidden!s:.100}")
+        _check_filter(self.command_filter)
+        _check_layout(self.observation_layout, len(self.observation_names))
+        if self.activation not in ACTIVATIONS:
+            raise PolicyError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r:.40}")
+        if self.quaternion_order != "xyzw":
+            raise PolicyError(f"quaternion_order must be xyzw, got {self.quaternion_order!r:.40}")
+
     @property
     def sizes(self) -> tuple[int, ...]:
         """Sizes of observation, hidden layers and action, in this order."""
@@ -60,7 +116,7 @@ class PolicyInterface:
     def from_json(cls, data: Any) -> PolicyInterface:
         """Restore a policy's interface from the JSON object that `to_json` returns.
 
-        Raises PolicyError: a field is missing, unknown or of another type.
+        Raises PolicyError: fields are missing or invalid.
         """
         if not isinstance(data, dict):
             raise PolicyError("the interface must be a JSON object")
@@ -71,9 +127,48 @@ class PolicyInterface:
         try:
             interface = cls(**values)
             check_types("interface field", interface)
-        except InputError as error:
+        except PolicyError:
+            raise
+        except (InputError, TypeError, AttributeError) as error:
             raise PolicyError(f"the interface has a field of another type: {error}") from error
         return interface
+
+
+def _check_filter(fields: Json) -> None:
+    """Raise PolicyError unless a command filter has exactly the fields of `FilterCfg`, with valid values."""
+    if set(fields) != {*FILTERED, "horizon", "speed_floor"}:
+        raise PolicyError(f"command_filter must have the fields {', '.join(FILTERED)}, horizon, speed_floor")
+    numbers = [fields["horizon"], fields["speed_floor"], *(each for name in FILTERED for each in fields[name].values())]
+    if any(isinstance(number, bool) for number in numbers):
+        raise PolicyError("command_filter must hold numbers")
+    try:
+        check_filter_speed(fields["horizon"], fields["speed_floor"])
+        for name in FILTERED:
+            check_angle_limits(name, **fields[name])
+    except (InputError, TypeError) as error:
+        raise PolicyError(f"command_filter: {error}") from error
+
+
+def _check_layout(layout: Json, width: int) -> None:
+    """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps.
+
+    A term's columns are `history` frames of equal width.
+    """
+    first = 0
+    for name, term in layout.items():
+        where = f"observation_layout {name!r:.60}"
+        if set(term) != set(LAYOUT_FIELDS) or any(type(term[key]) is not int for key in ("first", "end", "history")):
+            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}; first, end and history whole numbers")
+        if term["first"] != first or term["end"] <= first or not 1 <= term["history"] <= MAX_HISTORY:
+            raise PolicyError(f"{where} must begin at column {first}, with 1 to {MAX_HISTORY} frames")
+        if (term["end"] - first) % term["history"]:
+            raise PolicyError(f"{where} must hold whole frames")
+        for key in ("scale", "clip"):
+            if isinstance(term[key], bool) or not 1.0e-6 <= term[key] <= 1.0e6:
+                raise PolicyError(f"{where}: {key} must lie in 1e-6 to 1e6, got {term[key]!r:.60}")
+        first = term["end"]
+    if layout and first != width:
+        raise PolicyError(f"observation_layout has {first} columns, the observation {width}")
 
 
 def checksum_entry(data: bytes) -> bytes:
@@ -93,7 +188,7 @@ def make_interface(
     """Return the interface (observation, action, motors, time steps) of policies for a task.
 
     description: result of `jumper_warp.tasks.interface.interface`. policy_dt, physics_dt: [s]. hidden: widths of the
-    hidden layers. activation: elu, relu or tanh. Raises PolicyError: a field is missing, unknown or of another type.
+    hidden layers. activation: elu, relu or tanh. Raises PolicyError: a field is missing, unknown or invalid.
     """
     shape = {"policy_dt": policy_dt, "physics_dt": physics_dt, "hidden": list(hidden), "activation": activation}
     fields = dataclasses.fields(PolicyInterface)

@@ -20,7 +20,7 @@ from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.checks import check_bounds, check_type, check_types
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_filter_speed, check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import KernelStruct
 
@@ -32,9 +32,6 @@ MOTOR_BOUNDS = {
     "peak": (1.0e-3, 1.0e3, "N m"), "cutoff_speed": (0.0, 1.0e3, "rad/s"), "no_load_speed": (0.0, 1.0e3, "rad/s"),
 }  # fmt: skip
 """Smallest and largest value of the fields of `MotorKindCfg`, and unit."""
-FILTER_ANGLE = 1440.0  # [deg] Bound of limits in a command filter: twice the bound of motor targets
-FILTER_BOUNDS = {"horizon": (1.0e-3, 10.0, "s"), "speed_floor": (1.0e-3, 1.0e4, "deg/s")}
-"""Smallest and largest value of fields of `FilterCfg`, and unit."""
 MOTOR_CONSTANTS = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
 """Constants of a motor in `MotorArrays`; units as in `jumper_warp.kernels.actuation.motors`."""
 LIMITS = ("lower", "upper", "lower_zone", "upper_zone")
@@ -179,12 +176,7 @@ class LimitsCfg:
     def __post_init__(self) -> None:
         """Raise InputError unless the limits are finite, lower < upper, and their hard zones do not overlap."""
         check_types("angle", self)
-        if not -FILTER_ANGLE <= self.lower < self.upper <= FILTER_ANGLE:
-            allowed = f"within {FILTER_ANGLE:g} deg"
-            raise InputError(f"lower limit must be below upper limit, {allowed}, got {self.lower}, {self.upper}")
-        zones = self.lower_zone, self.upper_zone
-        if not (min(zones) >= 0.0 and sum(zones) <= self.upper - self.lower):
-            raise InputError(f"hard zones must be >= 0 without overlap, got {self.lower_zone}, {self.upper_zone}")
+        check_angle_limits("angle", **vars(self))
 
 
 @dataclass(frozen=True)
@@ -203,7 +195,7 @@ class FilterCfg:
     def __post_init__(self) -> None:
         """Raise InputError if horizon or speed floor is out of its range."""
         check_types("filter", self)
-        check_bounds("filter", self, FILTER_BOUNDS)
+        check_filter_speed(self.horizon, self.speed_floor)
 
 
 JUMP_LATERAL = LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0)

@@ -22,6 +22,7 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
 """Valid names of tasks, terms, observation columns and joints, for comma-separated lists and file names."""
 ACTIVATIONS = ("elu", "relu", "tanh")  # Names of the activations of hidden layers
 MAX_HIDDEN, MAX_WIDTH = 64, 65536  # Largest number of hidden layers, and of units in one
+FILTER_ANGLE = 1440.0  # [deg] Bound of limits in a command filter: twice the bound of motor targets
 FLOAT32_MAX = 3.4028234e38  # Largest finite float32; settings are converted to float32 on a device
 MOST_WORLDS = 2**20  # Largest number of simulated worlds
 MOST_SETTING = 1.0e6  # Largest absolute value of a setting of a task, in its unit
@@ -196,6 +197,30 @@ def check_seed(value: Any) -> int:
     if (number := _integer(value)) is None or not 0 <= number <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
     return number
+
+
+def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:
+    """Raise InputError unless limits of an angle [deg] are finite and in order, and zones inside do not overlap.
+
+    lower_zone, upper_zone: widths of hard zones inside the limits [deg], >= 0, in which a command filter clamps
+    commands toward the limit at any speed.
+    """
+    if not -FILTER_ANGLE <= lower < upper <= FILTER_ANGLE:
+        raise InputError(
+            f"{name}: lower limit must be below upper limit, within {FILTER_ANGLE:g} deg, got {lower}, {upper}"
+        )
+    if not (lower_zone >= 0.0 and upper_zone >= 0.0 and lower_zone + upper_zone <= upper - lower):
+        raise InputError(f"{name}: hard zones must be >= 0 without overlap, got {lower_zone}, {upper_zone}")
+
+
+def check_filter_speed(horizon: float, speed_floor: float) -> None:
+    """Raise InputError for a command filter's horizon outside 1 ms to 10 s, or a speed floor outside 1e-3 to 1e4 deg/s.
+
+    horizon: [s]; speed_floor: [deg/s].
+    """
+    for name, value, low, high in (("horizon", horizon, 1.0e-3, 10.0), ("speed_floor", speed_floor, 1.0e-3, 1.0e4)):
+        if not low <= value <= high:
+            raise InputError(f"filter {name} must be in {low:g} to {high:g}, got {value}")
 
 
 def version_error(version: str, known: int, last: str = LAST_OF_PREVIOUS_VERSION) -> str:

@@ -269,6 +269,7 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
     assert policy.recipe().task.curriculum.numbers["promote_after"] == 2
     assert policy.config["train"]["num_envs"] == 16 and policy.config["iteration"] == 2
+    assert (trained_run / "policy" / "learning_curve.jsonl").read_text().count("\n") >= 1
 
 
 def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, capsys):

@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from cli_helpers import run
+from jumper_warp.policies.catalog import add_files
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
 
@@ -99,3 +100,13 @@ def test_info_refuses_a_page_that_is_a_link_to_another_folder(tmp_path, capsys, 
     (folder / "README.md").symlink_to(target)
     code, out, err = run(capsys, "info", str(folder))
     assert (code, out) == (2, "") and len(err) == 1 and "README.md" in err[0]
+
+
+@pytest.mark.parametrize("change", [{"trials": "4"}, {"value": [1]}, {"unit": 3}])
+def test_info_refuses_metrics_of_another_type(tmp_path, capsys, change):
+    folder = shutil.copytree(POLICIES / "attitude", tmp_path / "mine")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    next(iter(metrics["rows"][0]["metrics"].values())).update(change)
+    add_files(folder, {"metrics.json": json.dumps(metrics).encode()})
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and len(err) == 1 and "metrics.json: metrics of another type" in err[0]

@@ -20,6 +20,7 @@ from jumper_warp.utils import assets
 from jumper_warp.utils.assets import policy_tasks
 
 FILTER = dataclasses.asdict(vertical_jump_filter())
+TERM = {"first": 0, "end": 1, "scale": 1.0, "clip": 1.0, "history": 1}
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -261,6 +262,31 @@ def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
     with pytest.raises(PolicyError, match=message) as refusal:
         load_policy(folder)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
+        ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
+        (
+            {"command_filter": {"horizon": 0.1}},
+            "command_filter must have the fields lateral, transversal, sum, horizon",
+        ),
+        ({"command_filter": FILTER | {"sum": FILTER["lateral"] | {"lower": 20.0}}}, "sum: lower limit must be below"),
+        ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
+        ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
+        ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
+        ({"hidden": (65537,)}, "hidden must name 1 to 64 widths from 1 to 65536"),
+        ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
+        ({"command_filter": FILTER | {"horizon": True}}, "command_filter must hold numbers"),
+        ({"observation_layout": {"a": TERM | {"end": 3, "history": 1.5}}}, "first, end and history whole numbers"),
+        ({"observation_layout": {"a": TERM | {"clip": True}}}, "clip must lie in"),
+    ],
+)
+def test_refuses_an_invalid_interface(change, message):
+    with pytest.raises(PolicyError, match=message):
+        make_interface(**change)
 
 
 @pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])

@@ -1,11 +1,12 @@
 import dataclasses
 import json
+import math
 
 import pytest
 
 import hold_height
 from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.policies.spec import PolicyInterface, make_interface
+from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.interface import interface
@@ -33,6 +34,21 @@ def test_interface_of_the_vertical_jump_has_the_robots_values():
 def test_observation_layout_has_scale_and_history_of_a_term():
     layout = make_interface(interface(hold_height.hold_height()), **SHAPE).observation_layout
     assert layout["height"] == {"first": 1, "end": 4, "scale": 5.0, "clip": 100.0, "history": 3}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda layout: layout["lin_vel"].update(first=4), "'lin_vel' must begin at column 3"),
+        (lambda layout: layout.pop("last_action"), "observation_layout has 99 columns, the observation 147"),
+        (lambda layout: layout["height"].update(scale=math.nan), "'height': scale must lie in 1e-6 to 1e6, got nan"),
+    ],
+)
+def test_refuses_an_invalid_observation_layout(change, message):
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
+    change(spec["observation_layout"])
+    with pytest.raises(PolicyError, match=message):
+        PolicyInterface.from_json(json.loads(json.dumps(spec)))
 
 
 @pytest.fixture
