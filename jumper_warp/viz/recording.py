@@ -8,13 +8,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.utils.arrays import read_npz, write_npz
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, parse_json
-from jumper_warp.viz.shapes import ShapeMesh, packed_shapes, unpacked_shapes
+from jumper_warp.viz.shapes import SURFACE, ShapeMesh, packed_shapes, unpacked_shapes
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
@@ -28,7 +29,7 @@ ARRAYS = (
     "commands",
 )  # fields of `Recording` that are arrays
 MOTION = "motion/"  # Begin of the names of the file's arrays that `Recording.motion` holds
-FARTHEST = 1.0e6  # [m] Largest distance between drawings of consecutive worlds, and coordinate of a dumped body
+FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a dimensionless quantity is 1."""
 
@@ -116,7 +117,8 @@ class Recording:
 def load_npz(path: Path) -> Recording:
     """Load a recording from a file written by `Recording.save_npz`.
 
-    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version.
+    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version, or an
+    entry has another type or shape.
     """
     archive = read_npz(path, "recording", RecordingError)
     try:
@@ -124,7 +126,8 @@ def load_npz(path: Path) -> Recording:
         if header["format"] != FORMAT or header["version"] != VERSION:
             raise RecordingError(f"expected a {FORMAT} of version {VERSION}")
         recording = _from_archive(header, archive)
-        _check_lengths(recording)
+        _check_arrays(recording)
+        _check_names(recording)
         return recording
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         reason = f"{type(error).__name__}: {error!s:.200}"
@@ -132,7 +135,7 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
-    """Build a recording from a NumPy archive; header: its decoded JSON entry `header`."""
+    """Build a recording, without checks, from a NumPy archive; header: its decoded JSON entry `header`."""
     return Recording(
         **{name: archive[name] for name in ARRAYS},
         worlds=tuple(header["worlds"]),
@@ -147,12 +150,69 @@ def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
     )
 
 
-def _check_lengths(recording: Recording) -> None:
-    """Raise RecordingError for an array that does not belong to the recording's frames, worlds and bodies."""
+def _check(name: str, valid: Any) -> None:
+    """Raise RecordingError, with the name of an entry, unless it is valid."""
+    if not valid:
+        raise RecordingError(f"{name} is of another type or shape, or out of range")
+
+
+def _check_arrays(recording: Recording) -> None:
+    """Raise RecordingError for an array of another type or shape, or times or meshes that cannot be drawn.
+
+    A file may come from anywhere, and drawing a malformed one would fail with an obscure error. Poses of a diverged
+    world may be anything in later frames, which are not drawn.
+    """
     frames, worlds, bodies = (len(part) for part in (recording.times, recording.worlds, recording.bodies))
-    arrays = {"contact_points": recording.contact_points, "contact_forces": recording.contact_forces}
-    lengths = {"poses": (recording.poses, (frames, bodies))}
-    lengths |= {name: (values, (frames, worlds)) for name, values in (arrays | recording.motion).items()}
-    for name, (values, expected) in lengths.items():
-        if values.shape[:2] != expected:
-            raise RecordingError(f"{name} has the shape {values.shape}, expected {expected} first")
+    contacts, goals = recording.contact_points.shape[2:3], recording.goals.shape[1:2]
+    for name, *shapes in (
+        ("times", (frames,)),
+        ("poses", (frames, bodies, 7)),
+        ("contact_points", (frames, worlds, *contacts, 3)),
+        ("contact_forces", (frames, worlds, *contacts, 3)),
+        ("goals", (worlds, *goals, 3), (0, *goals, 3)),
+        ("heights", (worlds,), (0,)),
+        ("commands", (frames, worlds, 3), (0, *recording.commands.shape[1:2], 3)),
+    ):
+        values = getattr(recording, name)
+        _check(name, values.dtype.kind in "fiu" and values.shape in shapes)
+    for values in recording.motion.values():
+        _check("motion", values.dtype.kind in "biuf" and values.shape[:2] == (frames, worlds))
+    for values in recording.series.values():
+        _check("series", values.dtype.kind in "fiu" and values.shape == (frames,))
+    times = recording.times
+    _check("times", frames > 0 and np.isfinite(times).all() and (np.diff(times) > 0.0).all())
+    points = recording.contact_points[np.isfinite(recording.poses).all(axis=(1, 2))]  # where no world has diverged
+    _check("poses", not (np.abs(recording.poses[0]) > FARTHEST).any())
+    _check("contact_points", (np.abs(points) <= FARTHEST).all())
+    for shape in recording.shapes:
+        for name in SURFACE:
+            values = getattr(shape, name)
+            kinds, count = ("iu", -1) if name == "triangles" else ("f", len(shape.vertices))
+            valid = values.dtype.kind in kinds and values.ndim == 2 and values.shape[1] == 3
+            _check(f"{name} of a shape", valid and np.isfinite(values).all() and count in (-1, len(values)))
+        corners = shape.triangles
+        _check("triangles of a shape", corners.size and 0 <= corners.min() and corners.max() < len(shape.vertices))
+
+
+def _check_names(recording: Recording) -> None:
+    """Raise RecordingError for entries of the header that are malformed, or do not belong to worlds and bodies.
+
+    Names become paths of entities in the Rerun viewer, so that their parts must be as expected.
+    """
+    worlds = recording.worlds
+    frames = len(recording.times)
+    _check("worlds", worlds and all(type(world) is int and world >= 0 for world in worlds))
+    _check("worlds", len(set(worlds)) == len(worlds))
+    _check("bodies", all(re.fullmatch(r"world_\d+/.+", body) for body in recording.bodies))
+    _check("bodies", {f"world_{world}" for world in worlds} == {body.split("/")[0] for body in recording.bodies})
+    _check("series", all(SERIES_NAME.fullmatch(name) for name in recording.series))
+    _check("labels", len(recording.labels) in (0, len(worlds)) and all(type(each) is str for each in recording.labels))
+    _check("notes", isinstance(recording.notes, dict))
+    for words in recording.states.values():
+        _check("states", type(words) is list and len(words) == frames and all(type(word) is str for word in words))
+    _check("spacing", type(recording.spacing) in (int, float) and abs(recording.spacing) <= FARTHEST)
+    for shape in recording.shapes:
+        _check("name of a shape", type(shape.name) is str)
+        _check("body of a shape", type(shape.body) is int and -1 <= shape.body < len(recording.bodies))
+        valid = len(shape.color) == 3 and all(type(part) in (int, float) and 0.0 <= part <= 1.0 for part in shape.color)
+        _check("color of a shape", valid)
