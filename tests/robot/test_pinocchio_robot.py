@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from jumper_warp.robot.description import MOTOR_JOINTS, load_description
-from pinocchio_model import build_pinocchio
+from support.pinocchio_model import build_pinocchio
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
 
@@ -61,6 +61,16 @@ def test_closed_velocity_matches_differences_of_configurations(moving, robot):
     )
     rates = (ahead - behind)[robot.knee_q] / (2.0 * step)
     assert v[robot.knee_v] == pytest.approx(rates, abs=1e-7)
+
+
+def test_paw_velocities_and_jacobians_match_differences_of_positions(moving, robot):
+    q, v = moving
+    step = 1e-6  # [s]
+    ahead, behind = (robot.paw_positions(pin.integrate(robot.model, q, sign * step * v)) for sign in (1, -1))
+    assert robot.paw_velocities(q, v) == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-7)
+    fixed_base = robot.closed_velocity(q, np.zeros(6), v[robot.motor_v])
+    velocities = np.einsum("kij,kj->ki", robot.paw_jacobians(q), v[robot.motor_v].reshape(4, 3))
+    assert velocities == pytest.approx(robot.paw_velocities(q, fixed_base), abs=1e-12)
 
 
 def test_robot_at_rest_falls_freely(robot):

@@ -16,7 +16,7 @@ from columns import Y, Z
 from jumper_warp.robot.description import LEGS, knee_angles, leg_dimensions, load_description
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
-from pinocchio_model import build_pinocchio
+from support.pinocchio_model import build_pinocchio
 
 LATERAL = (-50.0, 110.0)
 TRANSVERSAL = (-30.0, 140.0)

@@ -1,7 +1,7 @@
 """The robot in Pinocchio: an independent reference for kinematics and rigid-body dynamics.
 
 `build_pinocchio()` returns the described robot or that of an overlay, without ground, friction, knee damping and
-springs. `tests/sim/test_solver_flight.py` compares the project's dynamics with it.
+springs. `experiments/dynamics_agreement.py` compares the project's dynamics with it.
 """
 
 from __future__ import annotations
@@ -75,6 +75,27 @@ class PinocchioRobot:
         """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
         pin.forwardKinematics(self.model, self.data, q)
         return np.array([self.data.oMi[c.joint1_id].act(c.joint1_placement.translation) for c in self.constraints])
+
+    def paw_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the velocities of the paws' centres [m/s], shape (4, 3), world frame, legs FL, FR, BL, BR.
+
+        q: (27,); v: (26,), as `closed_velocity` returns it.
+        """
+        pin.forwardKinematics(self.model, self.data, q, v)
+        velocities = []
+        for c in self.constraints:
+            twist = self.data.v[c.joint1_id]
+            rotation = self.data.oMi[c.joint1_id].rotation
+            velocities.append(rotation @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
+        return np.array(velocities)
+
+    def paw_jacobians(self, q: np.ndarray) -> np.ndarray:
+        """Return the paws' Jacobians [m], (4, 3, 3): velocity in the world frame per motor rate, with the base at rest.
+
+        Axes: legs FL, FR, BL, BR; x, y, z; the leg's motors lateral, outer, inner. q: configuration (27,).
+        """
+        rates = (np.tile(motor, 4) for motor in np.eye(3))
+        return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
         """Return Pinocchio's velocity v, (26,), for given base and motor rates, with knee rates that keep loops closed.
