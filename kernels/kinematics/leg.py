@@ -1,4 +1,4 @@
-"""Forward kinematics of one leg, and inverse velocity kinematics.
+"""Forward kinematics of one leg, its Jacobian and inverse velocity kinematics.
 
 Motor angles and rates are ordered lateral, outer, inner. The ankle is the centre of the paw. A leg's housing turns
 about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward; a positive outer or inner
@@ -8,7 +8,7 @@ front: +1 front leg, -1 back leg. The five-bar loop is planar: points (x, z) of 
 
 import warp as wp
 
-from ..scalar import real, vec2, vec3
+from ..scalar import mat33, real, vec2, vec3
 from .five_bar import FiveBar, five_bar
 from .geometry import LegGeometry
 
@@ -39,6 +39,20 @@ def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: 
 
 
 @wp.func
+def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
+    """Return the Jacobian of the ankle position (body axes) w.r.t. lateral, outer, inner [m/rad], 3x3; angles [rad]."""
+    loop = five_bar(geo, outer, inner)
+    arm = rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
+    by_outer = rotate_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
+    by_inner = rotate_lateral(geo, lateral, vec3(loop.ankle_di[0], real(0.0), loop.ankle_di[1]))
+    return mat33(
+        real(0.0), by_outer[0], by_inner[0],
+        -geo.side * arm[2], by_outer[1], by_inner[1],
+        geo.side * arm[1], by_outer[2], by_inner[2],
+    )  # fmt: skip
+
+
+@wp.func
 def damped_ratio(speed: real, lever: real) -> real:
     """Return a thigh's rate [rad/s] for an ankle speed along the shank, damped where thigh and shank nearly align.
 
@@ -53,8 +67,8 @@ def damped_ratio(speed: real, lever: real) -> real:
 def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec3:
     """Return motor rates [rad/s] that move the ankle at `ankle_vel` [m/s] relative to the body, in the body frame.
 
-    Exact at the motor angles [rad] within joint limits, unless a thigh and its shank are within 3.3 degrees of one
-    line; there the rates are damped, to at most 100 rad/s per m/s along the shank.
+    The inverse of `leg_jacobian` at the motor angles [rad], exact within joint limits unless a thigh and its shank are
+    within 3.3 degrees of one line; there the rates are damped, to at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
     vel = rotate_lateral(geo, -angles[0], ankle_vel)
@@ -65,3 +79,14 @@ def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec
     outer_rate = damped_ratio(wp.dot(loop.outer_shank, in_plane), wp.dot(loop.outer_shank, loop.outer_knee_do))
     inner_rate = damped_ratio(wp.dot(loop.inner_shank, in_plane), wp.dot(loop.inner_shank, loop.inner_knee_di))
     return vec3(lateral_rate, outer_rate, inner_rate)
+
+
+@wp.func
+def knee_angles(geo: LegGeometry, loop: FiveBar, outer: real, inner: real) -> vec2:
+    """Return the passive (outer, inner) knee angles [rad] of a loop at motor angles [rad]; positive bends inward.
+
+    A knee angle is the rotation of the shank less that of the thigh; rotations are about housing +y, from -z.
+    """
+    outer_shank = wp.atan2(-loop.outer_shank[0], -loop.outer_shank[1])
+    inner_shank = wp.atan2(-loop.inner_shank[0], -loop.inner_shank[1])
+    return vec2(outer + geo.front * outer_shank, inner - geo.front * inner_shank)
