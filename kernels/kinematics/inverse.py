@@ -17,7 +17,7 @@ away from the leg's other thigh). Housing axes are body axes turned about x by t
 
 import warp as wp
 
-from ..scalar import real, vec2, vec3
+from ..scalar import quat, real, vec2, vec3
 from .five_bar import five_bar
 from .geometry import LegGeometry
 from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, rotate_lateral
@@ -194,3 +194,53 @@ def leg_inverse_kinematics(geo: LegGeometry, limits: LegLimits, ankle_body: vec3
     pose.reachable = wp.where(miss > REACHED or not finite, 0, 1)
     pose.residual = residual
     return pose
+
+
+@wp.kernel
+def paws_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    motors: wp.array2d(dtype=real),
+    # out
+    paws: wp.array2d(dtype=vec3),
+):
+    """Write paw centres [m] (4, n) in the body frame for motor angles [rad] (12, n) of n robots; launch over (4, n)."""
+    leg, robot = wp.tid()
+    m = 3 * leg
+    paws[leg, robot] = leg_forward_kinematics(
+        geometry[leg], motors[m, robot], motors[m + 1, robot], motors[m + 2, robot]
+    )
+
+
+@wp.kernel
+def inverse_kinematics_kernel(
+    # in
+    geometry: wp.array(dtype=LegGeometry),
+    limits: LegLimits,
+    base_pos: wp.array(dtype=vec3),
+    base_quat: wp.array(dtype=quat),
+    paws: wp.array2d(dtype=vec3),
+    paws_in_world: int,
+    # out
+    motors: wp.array2d(dtype=real),
+    knees: wp.array2d(dtype=real),
+    reachable: wp.array2d(dtype=wp.int32),
+    residual: wp.array2d(dtype=real),
+):
+    """Write the joint angles that put the paws at target positions; launch over (4, n) for n robots.
+
+    geometry: 4 legs. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): target centres of
+    the paws, in the body frame, or in the world frame if `paws_in_world` is 1 (the base is not read otherwise).
+    motors (12, n), knees (8, n: outer, inner per leg) [rad]. reachable (4, n), residual [m] (4, n): see `LegPose`.
+    """
+    leg, robot = wp.tid()
+    paw = paws[leg, robot]
+    if paws_in_world == 1:
+        paw = wp.quat_rotate_inv(base_quat[robot], paw - base_pos[robot])
+    pose = leg_inverse_kinematics(geometry[leg], limits, paw)
+    for joint in range(3):
+        motors[3 * leg + joint, robot] = pose.motors[joint]
+    knees[2 * leg, robot] = pose.knees[0]
+    knees[2 * leg + 1, robot] = pose.knees[1]
+    reachable[leg, robot] = pose.reachable
+    residual[leg, robot] = pose.residual

@@ -66,35 +66,6 @@ def make_leg_kernel(package):
     return leg_kernel
 
 
-def make_inverse_kernel(package):
-    """Return a kernel that evaluates `kinematics.inverse` for paws in the body frame, or in that of the world."""
-    names = ("kinematics.geometry", "kinematics.inverse", "scalar")
-    geometry, inverse, scalar = (importlib.import_module(f"{package}.{name}") for name in names)
-    real, vec3 = scalar.real, scalar.vec3
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def inverse_kernel(
-        legs: wp.array(dtype=geometry.LegGeometry), limits: inverse.LegLimits,
-        base_pos: wp.array(dtype=vec3), base_quat: wp.array(dtype=scalar.quat), paws: wp.array2d(dtype=vec3),
-        paws_in_world: int, motors: wp.array2d(dtype=real), knees: wp.array2d(dtype=real),
-        reachable: wp.array2d(dtype=wp.int32), residual: wp.array2d(dtype=real),
-    ):  # fmt: skip
-        """Write the outputs of `Build.solve`; launch over (4, n)."""
-        leg, robot = wp.tid()
-        paw = paws[leg, robot]
-        if paws_in_world == 1:
-            paw = wp.quat_rotate_inv(base_quat[robot], paw - base_pos[robot])
-        pose = inverse.leg_inverse_kinematics(legs[leg], limits, paw)
-        for joint in range(3):
-            motors[3 * leg + joint, robot] = pose.motors[joint]
-        knees[2 * leg, robot] = pose.knees[0]
-        knees[2 * leg + 1, robot] = pose.knees[1]
-        reachable[leg, robot] = pose.reachable
-        residual[leg, robot] = pose.residual
-
-    return inverse_kernel
-
-
 class Build:
     """Kernels of one precision, launched on NumPy arrays; package: jumper_warp.kernels or kernels_float64."""
 
@@ -106,7 +77,6 @@ class Build:
         geometry = importlib.import_module(f"{package}.kinematics.geometry")
         self.legs = leg_geometry_array(load_description(), geometry, "cpu")
         self.leg_kernel = make_leg_kernel(package)
-        self.inverse_kernel = make_inverse_kernel(package)
         self.limits = self.ik.LegLimits()
         for name, (lower, upper) in {"lateral": LATERAL, "transversal": TRANSVERSAL, "sum": SUM}.items():
             setattr(self.limits, f"{name}_lower", math.radians(lower))
@@ -131,7 +101,7 @@ class Build:
         orientation = self.array(base_quat if in_world else np.zeros((n, 4)), quat)
         out = [self.zeros(12, n), self.zeros(8, n), self.zeros(4, n, wp.int32), self.zeros(4, n)]
         inputs = [self.legs, self.limits, pos, orientation, self.array(paws, vec3), int(in_world)]
-        wp.launch(self.inverse_kernel, (4, n), inputs, out, device="cpu")
+        wp.launch(self.ik.inverse_kinematics_kernel, (4, n), inputs, out, device="cpu")
         return [array.numpy() for array in out]
 
     def legs_at(self, motors, ankle_vel=None):
