@@ -46,7 +46,7 @@ class GradientCheck:
         for sign in (1.0, -1.0):
             moved = {name: wp.clone(array) for name, array in arrays.items()}
             for name, direction in directions.items():
-                wp.to_torch(moved[name]).add_(sign * direction)
+                wp.to_torch(moved[name], requires_grad=False).add_(sign * direction)
             ends.append(gradients.evaluate(moved)[0].numpy().astype(np.float64))
         self._differences.append(0.5 * (ends[0] - ends[1]))
         rewards, components = gradients.shape
