@@ -118,3 +118,13 @@ def test_policies_are_evaluated_with_changed_flags():
     assert comparison.primary_name == "success_rate"
     assert [len(row.values) for row in comparison.primary] == [1, 1]
     assert any(row.metric == "apex_error_abs_mean_m" for row in comparison.exploratory)
+
+
+def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
+    primary = compared(runs, "base", "tuck", primary="-steps_to_80_percent").primary
+    base, tuck = primary
+    steps = [member.curve("Metrics/success")[0] for member in find_arms([runs / "base"])[0].members]
+    np.testing.assert_array_equal(base.values, [each[-1] for each in steps])  # none reaches 80 %
+    assert tuck.improvement == pytest.approx(0.5)
+    first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
+    assert (first.improvement, first.verdict) == (1.0, "better")
