@@ -185,6 +185,9 @@ def verdicts(comparison: Comparison) -> list[str]:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         lines.append(f"**Trainings of different lengths**, iterations: {listed}. Logged metrics are those of iteration "
                      f"{min(lengths.values())}.")  # fmt: skip
+    if len({value for row in comparison.primary for value in row.values}) == 1:
+        lines.append(f"**All seeds have the same {comparison.metric}**: train longer, or choose another metric by "
+                     "--primary.")  # fmt: skip
     if comparison.fewest_seeds < FEWEST_SEEDS:
         lines.append(f"**Fewer than {FEWEST_SEEDS} seeds** in an arm: intervals are unreliable, and a test can miss "
                      "any difference.")  # fmt: skip

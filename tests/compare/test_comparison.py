@@ -128,3 +128,11 @@ def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
     assert tuck.improvement == pytest.approx(0.5)
     first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
     assert (first.improvement, first.verdict) == (1.0, "better")
+
+
+def test_equal_values_of_all_seeds_are_noted(tmp_path):
+    for name in ("base", "tuck"):
+        for seed in range(1, 6):
+            save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
+    text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
+    assert "**All seeds have the same Metrics/success**" in text
