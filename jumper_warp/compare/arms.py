@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from jumper_warp.utils.files import Json, read_file, read_json
 OF_A_SEED = ("seed", "seeds", "run-name", "tags")  # Settings in which the runs of an arm may differ
 TERMS = ("Episode_Reward/", "Episode_Sum/")  # Begins of the logged names of reward terms
 TIME = "Perf/elapsed_s"
+STEPS_TO = re.compile(r"steps_to_(\d+)_percent")  # Metric: policy steps until the share that selects checkpoints
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,12 @@ class Member:
         ]
         return np.array(rows, dtype=float).reshape(-1, 3).T
 
+    def steps_to(self, metric: str, share: float) -> float:
+        """Return the policy steps of all worlds until a metric is at least `share`; all steps if it never is."""
+        steps, _, values = self.curve(metric)
+        reached = steps[values >= share]
+        return float(reached[0] if len(reached) else steps[-1])
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -110,7 +118,15 @@ class Arm:
         return {path.name: path.read_text("utf-8") for path in sorted((self.members[0].folder / SOURCES).glob("*.py"))}
 
     def last(self, metric: str) -> np.ndarray:
-        """Return the last logged value of a metric of every seed, (seeds,), without seeds that lack it."""
+        """Return the last logged value of a metric of every seed, (seeds,), without seeds that lack it.
+
+        `steps_to_95_percent`: policy steps of all worlds to 95 % of the metric that selects checkpoints; all steps of a
+        seed that does not reach it.
+        """
+        if share := STEPS_TO.fullmatch(metric):
+            return np.array(
+                [each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in self.members if each.log]
+            )
         return np.array([member.last[metric] for member in self.members if metric in member.last])
 
     def curves(self, metric: str, axis: int, points: int = 100) -> tuple[np.ndarray, np.ndarray]:

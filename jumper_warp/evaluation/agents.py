@@ -204,7 +204,7 @@ def print_statistics(log: AgentLog) -> None:
 
     table = Table(Column("reward, per step", no_wrap=True), "smallest", "largest", "mean", "not zero", box=None)
     for name, values in log.rewards.items():
-        numbers = (f"{value:.3g}" for value in (values.min(), values.max(), values.mean()))
+        numbers = (f"{value + 0.0:.3g}" for value in (values.min(), values.max(), values.mean()))
         table.add_row(name, *numbers, f"{100.0 * (values != 0.0).mean():.1f} %")
     print_table(table)
     table = Table(Column(f"termination, of {log.num_ended} episodes", no_wrap=True), "share", box=None)

@@ -285,7 +285,8 @@ def _extent(scene: Composition) -> np.ndarray:
     goals = scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.stays else np.zeros((0, 3))
     boxes = corners(scene.bases, ground)
     if scene.stays:
-        goals = np.array([scene.point(along, ground - 0.1, IN_FRONT) for along in (low, high)])  # labels of the axis
+        ends = (low + 0.1 - 0.08 * (high - low), high)  # the label of the axis is left of `low`
+        goals = np.array([scene.point(along, ground - 0.1, IN_FRONT) for along in ends])
     return np.concatenate(
         [boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]]
     )

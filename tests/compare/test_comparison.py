@@ -166,3 +166,21 @@ def test_a_missing_metric_is_refused_with_the_logged_ones(runs):
         _ = compared(runs, "base", "tuck", primary="Metrics/sucess").primary
     with pytest.raises(InputError, match="no run has logged Metrics/sucess; base has logged iteration"):
         compared(runs, "base", "tuck", metric="Metrics/sucess")
+
+
+def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
+    primary = compared(runs, "base", "tuck", primary="-steps_to_80_percent").primary
+    base, tuck = primary
+    steps = [member.curve("Metrics/success")[0] for member in find_arms([runs / "base"])[0].members]
+    np.testing.assert_array_equal(base.values, [each[-1] for each in steps])  # none reaches 80 %
+    assert tuck.improvement == pytest.approx(0.5)
+    first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
+    assert (first.improvement, first.verdict) == (1.0, "better")
+
+
+def test_equal_values_of_all_seeds_are_noted(tmp_path):
+    for name in ("base", "tuck"):
+        for seed in range(1, 6):
+            save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
+    text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
+    assert "**All seeds have the same Metrics/success**" in text

@@ -1,4 +1,4 @@
-"""Ablations of the jumps' departures from the paper, in the files of experiments/departures."""
+"""Files of `jumper compare --file` in experiments: departures from the paper, the paper's techniques, fused kernels."""
 
 import json
 import shlex
@@ -19,7 +19,7 @@ from jumper_warp.registry import load_task_module
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 
 FOLDER = Path(__file__).parents[2] / "experiments/departures"
-FILES = sorted(FOLDER.glob("*.toml"))
+FILES = sorted(path for path in FOLDER.parent.rglob("*.toml") if "[arms]" in path.read_text())
 
 
 @pytest.fixture(autouse=True)
@@ -32,22 +32,38 @@ def trained(file, name):
     settings = tomllib.loads((FOLDER / file).read_text())
     arm = settings["arms"][name]
     task, flags = (settings["task"], arm) if isinstance(arm, str) else (arm["task"], "")
-    return parse_train([task, *shlex.split(settings["flags"]), *shlex.split(flags)])[0]
+    return parse_train([task, *shlex.split(settings.get("flags", "")), *shlex.split(flags)])[0]
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_every_arm_changes_the_task_or_the_trainer_and_can_be_saved(file):
     settings = tomllib.loads(file.read_text())
-    kept = trained(file, "kept")
+    first = next(iter(settings["arms"]))
+    kept = trained(file, first)
     for name in settings["arms"]:
         recipe = trained(file, name)
         task = recipe.task
         assert task_from_json(json.loads(json.dumps(task_to_json(task)))) == task
         same = replace(task, name=kept.task.name) == kept.task and recipe.train.ppo == kept.train.ppo
-        assert same == (name == "kept"), name
+        assert same == (name == first), name
     values = {key: tuple(each) if isinstance(each, list) else each for key, each in settings["evaluation"].items()}
     replace(default_flags(kept.task.evaluation, "evaluate"), **values)
-    Conditions(**settings["conditions"])
+    Conditions(**settings.get("conditions", {}))
+
+
+@pytest.mark.parametrize("name", ["vertical_jump", "horizontal_jump"])
+def test_arms_switch_off_initialisation_estimates_and_curriculum(name):
+    file = f"../paper/{name}.toml"
+    task = trained(file, "full").task
+    modes = vars(trained(file, "no_initialisation").task.reset.settings.start_probability)
+    assert {mode for mode, probability in modes.items() if probability} == {"default"}
+    blind = trained(file, "no_estimates").task
+    assert {term.name for term, old in zip(blind.rewards, task.rewards, strict=True) if term != old} == {
+        term.name for term in task.rewards if term.name.startswith("estimated") and term.weight
+    }
+    ends = [term for term, old in zip(blind.terminations, task.terminations, strict=True) if term != old]
+    assert [(term.name[:9], term.numbers["tolerance"]) for term in ends] == [("predicted", 1.0e6)]
+    assert set(trained(file, "no_curriculum").task.levels) == {task.levels[-1]}
 
 
 @pytest.mark.parametrize("randomize", [False, True])
