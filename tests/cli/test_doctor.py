@@ -46,9 +46,13 @@ def test_device_that_fails_is_reported_and_the_exit_code_is_1(capsys, monkeypatc
 NO_CACHE = "(Not a directory): set WARP_CACHE_PATH to a writable folder"
 
 
-def test_kernel_cache_that_cannot_be_made_is_named():
-    folder = "/dev/null/kernels"
-    command, environment = [sys.executable, "-m", "jumper_warp", "doctor"], os.environ | {"WARP_CACHE_PATH": folder}
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [({"HOME": "/dev/null"}, "/dev/null/.cache/warp"), ({"WARP_CACHE_PATH": "/dev/null/kernels"}, "/dev/null/kernels")],
+)
+def test_kernel_cache_that_cannot_be_made_is_named(variables, folder):
+    environment = {key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    command, environment = [sys.executable, "-m", "jumper_warp", "doctor"], environment | variables
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     message = f"jumper: kernel cache {folder}/{wp.config.version} cannot be written {NO_CACHE}\n"
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.endswith(message)

@@ -1,10 +1,12 @@
 """`jumper list` and `jumper info` against the files in the policies' folders and the tasks themselves."""
 
 import json
+import shutil
 
 import pytest
 
 from cli_helpers import run
+from jumper_warp.policies.catalog import add_files
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
 
@@ -79,3 +81,32 @@ def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
     assert content["rewards"] == {term.name: term.numbers["weight"] for term in task.rewards}
     assert content["terminations"] == [term.name for term in task.terminations]
     assert content["observation_sizes"]["actor"] == len(task.observation_names)
+
+
+def test_info_refuses_metrics_that_differ_from_the_manifest(tmp_path, capsys):
+    folder = tmp_path / "altered"
+    shutil.copytree(POLICIES / "vertical_jump", folder)
+    text = (folder / "metrics.json").read_text()
+    (folder / "metrics.json").write_text(text.replace('"value": 0.96', '"value": 0.99', 1))
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and "metrics.json: truncated or altered" in err[0]
+
+
+@pytest.mark.parametrize("target", ["../secret.md", "README.md", "/dev/zero"])
+def test_info_refuses_a_page_that_is_a_link_to_another_folder(tmp_path, capsys, target):
+    (tmp_path / "secret.md").write_text("secret")
+    folder = shutil.copytree(POLICIES / "attitude", tmp_path / "mine")
+    (folder / "README.md").unlink()
+    (folder / "README.md").symlink_to(target)
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and len(err) == 1 and "README.md" in err[0]
+
+
+@pytest.mark.parametrize("change", [{"trials": "4"}, {"value": [1]}, {"unit": 3}])
+def test_info_refuses_metrics_of_another_type(tmp_path, capsys, change):
+    folder = shutil.copytree(POLICIES / "attitude", tmp_path / "mine")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    next(iter(metrics["rows"][0]["metrics"].values())).update(change)
+    add_files(folder, {"metrics.json": json.dumps(metrics).encode()})
+    code, out, err = run(capsys, "info", str(folder))
+    assert (code, out) == (2, "") and len(err) == 1 and "metrics.json: metrics of another type" in err[0]

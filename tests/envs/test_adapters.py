@@ -195,6 +195,16 @@ def test_reset_with_a_seed_equals_a_new_environment_with_it(resample_at):
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
 
 
+def test_reset_with_a_seed_returns_worlds_to_their_first_task():
+    env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
+    env.reset()
+    env.episodes.skill.zero_()
+    env.request(1)
+    env.reset(seed=5)
+    assert env.episodes.skill.numpy().tolist() == [1, 0]
+    assert env.episodes.requested_task.numpy().tolist() == [-1, -1]
+
+
 def test_equal_seeds_reproduce_and_others_differ():
     envs = GymVectorEnv(jumper())
     first, other, again = (envs.reset(seed=seed)[0] for seed in (5, 6, 5))

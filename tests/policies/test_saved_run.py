@@ -1,14 +1,18 @@
 import dataclasses
 import json
+import math
 
 import pytest
 
 import hold_height
-from jumper_warp.policies.spec import PolicyInterface, make_interface
+from jumper_warp.kernels.jump import rewards, terminations
+from jumper_warp.policies.spec import PolicyError, PolicyInterface, make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.tasks.jump.cfg import GroundCfg
+from jumper_warp.tasks.saving import TaskError, task_to_json
+from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 
 SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}  # [s], [s], widths
 
@@ -30,6 +34,21 @@ def test_interface_of_the_vertical_jump_has_the_robots_values():
 def test_observation_layout_has_scale_and_history_of_a_term():
     layout = make_interface(interface(hold_height.hold_height()), **SHAPE).observation_layout
     assert layout["height"] == {"first": 1, "end": 4, "scale": 5.0, "clip": 100.0, "history": 3}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda layout: layout["lin_vel"].update(first=4), "'lin_vel' must begin at column 3"),
+        (lambda layout: layout.pop("last_action"), "observation_layout has 99 columns, the observation 147"),
+        (lambda layout: layout["height"].update(scale=math.nan), "'height': scale must lie in 1e-6 to 1e6, got nan"),
+    ],
+)
+def test_refuses_an_invalid_observation_layout(change, message):
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
+    change(spec["observation_layout"])
+    with pytest.raises(PolicyError, match=message):
+        PolicyInterface.from_json(json.loads(json.dumps(spec)))
 
 
 @pytest.fixture
@@ -59,3 +78,56 @@ def test_restored_task_equals_the_saved_one(saved):
     assert nominal(config) == dataclasses.replace(
         task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
     )
+
+
+def test_missing_setting_gets_its_default(saved):
+    task, config = saved
+    del config["env"]["task"]["curriculum"]["promote_after"]
+    assert whole(config) == dataclasses.replace(task, curriculum=task.curriculum.replace(promote_after=5))
+
+
+def test_refuses_an_unknown_reward_unless_rewards_are_left_out(saved):
+    _, config = saved
+    config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
+    with pytest.raises(TaskError, match=r"task.rewards\[23\].func needs 'mine:my_own': pass the file"):
+        whole(config)
+    assert nominal(config).name == "vertical-jump"
+
+
+def test_restores_a_reward_outside_the_default_task(saved):
+    task, config = saved
+    task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_again, -3.0, threshold=0.1)))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
+    assert whole(config) == task
+
+
+@pytest.mark.parametrize("success", [False, True])
+def test_restores_a_termination_outside_the_default_task(saved, success):
+    task, config = saved
+    ending = TerminationTerm(terminations.left_stance, distance=0.3, success=success, time_out=success)
+    task = dataclasses.replace(task, terminations=(*task.terminations, ending))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
+    assert whole(config) == task
+
+
+def with_ground(task, ground):
+    """Return a copy of a jump task with these settings of the ground."""
+    settings = dataclasses.replace(task.reset.settings, ground=ground)
+    return dataclasses.replace(task, reset=dataclasses.replace(task.reset, settings=settings))
+
+
+def test_restores_ground_randomisation_with_none_as_default(saved):
+    task, config = saved
+    uneven = with_ground(task, GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(uneven)))
+    assert whole(config) == uneven
+    del config["env"]["task"]["reset"]["settings"]["ground"]
+    assert whole(config) == task
+
+
+def test_refuses_another_version_with_the_commit_that_reads_it(saved):
+    _, config = saved
+    for version in (4, 6):  # the present one is 5
+        config["env"]["task"]["version"] = version
+        with pytest.raises(TaskError, match=f"has version {version}, expected version 5; commit 7f5b55c3"):
+            nominal(config)

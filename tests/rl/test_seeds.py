@@ -8,7 +8,8 @@ import torch
 
 from jumper_warp.policies.catalog import newest_run
 from jumper_warp.rl import seeds
-from jumper_warp.rl.checkpoint import MANIFEST, load_checkpoint
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint
 from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import FROZEN, find_checkpoints
@@ -146,6 +147,14 @@ def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
         newest_run(f"{result.folder}:3")
 
 
+@pytest.mark.parametrize("content", ["[]", "{"])
+def test_a_damaged_manifest_of_a_seed_is_named(cfg, content):
+    folder = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder
+    (folder / "seed_4" / CHECKPOINTS / MANIFEST).write_text(content)
+    with pytest.raises(CheckpointError, match=r"seed_4.checkpoints.manifest.json"):
+        newest_run(folder)
+
+
 def test_a_new_run_needs_the_initial_actor_that_its_settings_name(cfg):
     new = dataclasses.replace(cfg, init_policy="vertical_jump", resume="latest-or-new")
     for function, settings in ((seeds.train, new), (train, dataclasses.replace(new, seeds=()))):
@@ -174,6 +183,21 @@ def test_name_of_a_run_is_in_its_folder_and_its_title(cfg):
     assert (settings["seed"], settings["seeds"], settings["run_name"]) == (4, [], "first try")
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": (1, 1)}, "seeds must be distinct"),
+        ({"seeds": (1, -1)}, "seed must be in"),
+        ({"seeds": (1,), "trainer": "rsl-rl"}, "seeds are not supported"),
+        ({"run_name": "a/b"}, "task, run_name and tags"),
+        ({"tags": ("",)}, "task, run_name and tags"),
+    ],
+)
+def test_settings_of_seeds_and_names_are_checked(changes, message):
+    with pytest.raises(InputError, match=message):
+        TrainCfg(**changes)
+
+
 def test_resume_refuses_other_seeds(cfg):
     folder = str(seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder)
     with pytest.raises(InputError, match="has seeds 1, 4, 7, got seeds 1, 2"):
@@ -181,3 +205,10 @@ def test_resume_refuses_other_seeds(cfg):
     single = train(dataclasses.replace(cfg, seeds=(), max_iterations=2), SeededTask).folder
     with pytest.raises(InputError, match="has one seed"):
         seeds.train(dataclasses.replace(cfg, resume=str(single)), SeededTask)
+
+
+def test_resume_of_a_run_without_common_checkpoint_is_refused(cfg):
+    folder = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder
+    (folder / "seed_1" / CHECKPOINTS / "iteration_000002.pt").unlink()
+    with pytest.raises(CheckpointError, match="no usable checkpoint of the same iteration"):
+        find_checkpoints(dataclasses.replace(cfg, resume=str(folder)))

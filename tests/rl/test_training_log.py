@@ -11,6 +11,7 @@ from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, push_cfg
 
 LOGGED = TrainCfg(num_envs=1250, max_iterations=10, tensorboard=False, ppo=PpoCfg(num_steps=40))  # 50,000 steps each
@@ -104,6 +105,13 @@ def test_metrics_file_is_repaired_on_opening(tmp_path, content, kept):
     path.write_bytes(content)
     MetricsFile(path, 2).add(3, {})
     assert iterations(path) == [*kept, 3]
+
+
+def test_metrics_file_that_is_not_regular_is_refused(tmp_path):
+    path = tmp_path / METRICS_FILE
+    path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="not a regular file"):
+        MetricsFile(path, 2)
 
 
 def test_resume_hides_tensorboard_events_of_later_iterations(cfg):

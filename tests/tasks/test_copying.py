@@ -53,6 +53,13 @@ def test_copy_equals_the_task(make, how):
     assert same.params.names == task.params.names and same.params.values == task.params.values
 
 
+def test_task_reaches_a_spawned_process():
+    task = make_task("velocity-flat")
+    with spawned() as process:
+        assert process.submit(copy.copy, task).result() == task
+        assert process.submit(content, task).result() == content(task)
+
+
 def is_imported(module):
     """Return whether this process has imported a module."""
     return module in sys.modules
