@@ -68,7 +68,7 @@ class DeferredLoader(Loader):
 
 
 class DeferredFinder(MetaPathFinder):
-    """Import finder that defers the code of the modules in `DEFERRED` to their first use, and Ctrl-C in `UNINTERRUPTED`."""
+    """Import finder that defers the code of `DEFERRED` to its first use, and Ctrl-C to the end of `UNINTERRUPTED`."""
 
     def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Return the specification of a deferred module, None for any other module."""

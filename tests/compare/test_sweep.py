@@ -62,6 +62,27 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
     assert trained == pytest.approx(chosen)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "Train/mean_episode_length",
+            "Metrics/success",
+            "metric was 'Train/mean_episode_length', got 'Metrics/success'",
+        ),
+        ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
+        ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
+        ("--num-envs 8", "--num-envs 16", "flags was"),
+    ],
+)
+def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, message):
+    path = sweep_file(tmp_path)
+    open_study(read_sweep(path))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=message):
+        open_study(read_sweep(path))
+
+
 def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
     path = sweep_file(tmp_path, trials=1)
     work_on(path)
