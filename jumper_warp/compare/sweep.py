@@ -129,9 +129,7 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
         for name in FIXED:
             value = json.loads(json.dumps(getattr(sweep, name)))
             if (saved := study.user_attrs.get(name, value)) != value:
-                raise InputError(
-                    f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: choose another name"
-                )
+                raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
             study.set_user_attr(name, value)
         return study
     except (ImportError, ValueError, SQLAlchemyError) as error:

@@ -65,11 +65,7 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "Train/mean_episode_length",
-            "Metrics/success",
-            "metric was 'Train/mean_episode_length', got 'Metrics/success'",
-        ),
+        ("Train/mean_episode_length", "Metrics/success", "metric was 'Train/mean_episode_length'"),
         ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
         ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
         ("--num-envs 8", "--num-envs 16", "flags was"),
