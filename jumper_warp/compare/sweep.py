@@ -139,21 +139,27 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
 def work(sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe], worker: int = 0) -> None:
     """Run trials until the sweep has `trials` finished or pruned ones, also those of workers that died.
 
-    recipe_of: function of arguments of `jumper train`. worker: index of this process.
+    recipe_of: function of arguments of `jumper train`. worker: index of this process. Raises InputError: the storage
+    fails.
     """
+    from optuna.exceptions import StorageInternalError
     from optuna.trial import TrialState
+    from sqlalchemy.exc import SQLAlchemyError
 
     study = open_study(sweep, worker)
-    while True:
-        requeue_abandoned(study, sweep.grace)
-        states = [trial.state for trial in study.get_trials(deepcopy=False)]
-        done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
-        if done >= sweep.trials:
-            return
-        if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
-            time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
-        else:
-            run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    try:
+        while True:
+            requeue_abandoned(study, sweep.grace)
+            states = [trial.state for trial in study.get_trials(deepcopy=False)]
+            done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
+            if done >= sweep.trials:
+                return
+            if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
+                time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
+            else:
+                run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    except (StorageInternalError, SQLAlchemyError) as error:
+        raise InputError(f"storage of sweep {sweep.name}: {error!s:.200}") from error
 
 
 def requeue_abandoned(study: Any, grace: float) -> None:

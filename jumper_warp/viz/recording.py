@@ -87,7 +87,7 @@ class Recording:
         return self.poses[:, self.body_indices(rank)]
 
     def body_indices(self, rank: int) -> list[int]:
-        """Return the indices in `bodies` of the bodies of the rank-th recorded world. Raises InputError: no such rank."""
+        """Return the indices in `bodies` of a world's bodies by its rank. Raises InputError: no such rank."""
         check_type("rank", rank, int)
         if not 0 <= rank < len(self.worlds):
             raise InputError(f"rank must be in 0 to {len(self.worlds) - 1}, got {rank}")

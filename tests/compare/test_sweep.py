@@ -9,7 +9,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
@@ -77,6 +77,17 @@ def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, mes
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=message):
         open_study(read_sweep(path))
+
+
+def test_a_storage_that_fails_in_the_middle_of_a_sweep_is_named(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+
+    def damage(_):
+        (sweep.folder / "study.db").write_bytes(b"no database" * 1000)
+        raise optuna.TrialPruned("damaged")
+
+    with pytest.raises(InputError, match="storage of sweep two_settings"):
+        work(sweep, damage)
 
 
 def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
