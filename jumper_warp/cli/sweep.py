@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -68,7 +69,14 @@ def submit(cfg: SweepCfg, folder: Path) -> list:
     executor = submitit.AutoExecutor(folder / "workers", cluster=cfg.cluster)
     pairs = (setting.partition("=")[::2] for setting in cfg.slurm)
     executor.update_parameters(**{"timeout_min": 24 * 60, **{name: number(value) for name, value in pairs}})
-    return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    stderr = os.dup(2)
+    with (folder / "workers" / "controllers.log").open("ab") as log:
+        os.dup2(log.fileno(), 2)  # of submitit's controllers, which print a traceback when they are interrupted
+    try:
+        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
 
 
 def wait_for(jobs: Sequence[Any]) -> None:
