@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import os
+import signal
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -53,8 +56,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         if cfg.workers == 1:
             work_on(cfg.file)
         else:
-            for job in submit(cfg, sweep.folder):
-                job.result()
+            wait_for(submit(cfg, sweep.folder), cancel=cfg.cluster == "local")
     from jumper_warp.compare.sweep_report import write_sweep_report
 
     print(write_sweep_report(sweep))
@@ -67,7 +69,28 @@ def submit(cfg: SweepCfg, folder: Path) -> list:
     executor = submitit.AutoExecutor(folder / "workers", cluster=cfg.cluster)
     pairs = (setting.partition("=")[::2] for setting in cfg.slurm)
     executor.update_parameters(**{"timeout_min": 24 * 60, **{name: number(value) for name, value in pairs}})
-    return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    stderr = os.dup(2)
+    with (folder / "workers" / "controllers.log").open("ab") as log:
+        os.dup2(log.fileno(), 2)  # of submitit's controllers, which print a traceback when they are interrupted
+    try:
+        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+def wait_for(jobs: Sequence[Any], *, cancel: bool) -> None:
+    """Wait for jobs of submitit; if cancel, Ctrl-C, SIGTERM or SIGHUP ends them, and then this process."""
+    for each in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(each) is signal.SIG_DFL:  # not with nohup
+            signal.signal(each, lambda number, _: sys.exit(128 + number))
+    try:
+        for job in jobs:
+            job.result()
+    except (KeyboardInterrupt, SystemExit):
+        for job in jobs if cancel else ():
+            job.cancel()
+        raise
 
 
 def number(text: str) -> object:

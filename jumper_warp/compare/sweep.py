@@ -6,6 +6,7 @@ trial from the last checkpoint.
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import socket
@@ -30,6 +31,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
 POLL = 2.0  # [s] Time between two looks at the trials of other workers
+FIXED = ("task", "flags", "seeds", "metric", "direction")  # Settings that all trials of a sweep share
 RUN, ALIVE, WORKER = "run", "alive", "worker"  # Attributes of a trial: name of its run, time of the last sign, process
 
 
@@ -101,7 +103,8 @@ class Sweep:
 def open_study(sweep: Sweep, worker: int = 0) -> Any:
     """Return the Optuna study of a sweep, which is created if it does not exist; worker: index of this process.
 
-    Raises InputError: the storage cannot be opened, or a setting is out of Optuna's range.
+    Raises InputError: the storage cannot be opened, a setting is out of Optuna's range, or the study has another one of
+    the settings FIXED.
     """
     import optuna
     from optuna.storages.journal import JournalFileBackend, JournalStorage
@@ -119,10 +122,16 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
             storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
         pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
         sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
-        return optuna.create_study(
+        study = optuna.create_study(
             study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
             sampler=sampler,
         )  # fmt: skip
+        for name in FIXED:
+            value = json.loads(json.dumps(getattr(sweep, name)))
+            if (saved := study.user_attrs.get(name, value)) != value:
+                raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
+            study.set_user_attr(name, value)
+        return study
     except (ImportError, ValueError, SQLAlchemyError) as error:
         raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
@@ -130,21 +139,27 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
 def work(sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe], worker: int = 0) -> None:
     """Run trials until the sweep has `trials` finished or pruned ones, also those of workers that died.
 
-    recipe_of: function of arguments of `jumper train`. worker: index of this process.
+    recipe_of: function of arguments of `jumper train`. worker: index of this process. Raises InputError: the storage
+    fails.
     """
+    from optuna.exceptions import StorageInternalError
     from optuna.trial import TrialState
+    from sqlalchemy.exc import SQLAlchemyError
 
     study = open_study(sweep, worker)
-    while True:
-        requeue_abandoned(study, sweep.grace)
-        states = [trial.state for trial in study.get_trials(deepcopy=False)]
-        done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
-        if done >= sweep.trials:
-            return
-        if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
-            time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
-        else:
-            run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    try:
+        while True:
+            requeue_abandoned(study, sweep.grace)
+            states = [trial.state for trial in study.get_trials(deepcopy=False)]
+            done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
+            if done >= sweep.trials:
+                return
+            if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
+                time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
+            else:
+                run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    except (StorageInternalError, SQLAlchemyError) as error:
+        raise InputError(f"storage of sweep {sweep.name}: {error!s:.200}") from error
 
 
 def requeue_abandoned(study: Any, grace: float) -> None:

@@ -39,6 +39,8 @@ from jumper_warp.identification.results import (
     summarise,
 )
 from jumper_warp.robot.description import RobotDescription
+from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 
 COARSE_DT = 1.0 / 480.0  # [s] lower bound of the physics step in all stages but the last one
@@ -76,6 +78,9 @@ def identify(
     motions that identify no parameter.
     """
     check_distinct(motions)
+    check_type("parameters", parameters, ParameterSet)
+    check_type("noise", noise, NoiseLevels | None)
+    check_type("dt", dt, float | None)
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
         replay = MotionReplay(description=description, device=device, threads=threads)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.checks import check_count, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
@@ -72,6 +72,8 @@ def write_film(
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
+    check_type("ranks", ranks, Sequence[int])
+    check_count("number of ranks", len(ranks))
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
     images = _images(recording, times, size, eye, field_of_view, ranks, path.name)

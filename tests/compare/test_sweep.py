@@ -9,7 +9,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
@@ -60,6 +60,34 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
     trained = [arm.settings["env.rewards.jump-height.weight"] for arm in arms]
     chosen = [trial.params["env.rewards.jump-height.weight"] for trial in open_study(sweep).get_trials()]
     assert trained == pytest.approx(chosen)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Train/mean_episode_length", "Metrics/success", "metric was 'Train/mean_episode_length'"),
+        ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
+        ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
+        ("--num-envs 8", "--num-envs 16", "flags was"),
+    ],
+)
+def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, message):
+    path = sweep_file(tmp_path)
+    open_study(read_sweep(path))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=message):
+        open_study(read_sweep(path))
+
+
+def test_a_storage_that_fails_in_the_middle_of_a_sweep_is_named(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+
+    def damage(_):
+        (sweep.folder / "study.db").write_bytes(b"no database" * 1000)
+        raise optuna.TrialPruned("damaged")
+
+    with pytest.raises(InputError, match="storage of sweep two_settings"):
+        work(sweep, damage)
 
 
 def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
