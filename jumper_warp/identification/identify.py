@@ -40,7 +40,6 @@ from jumper_warp.identification.results import (
 )
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.checks import check_type
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 
 COARSE_DT = 1.0 / 480.0  # [s] lower bound of the physics step in all stages but the last one
