@@ -104,6 +104,7 @@ class EnvGradients:
         self._scale = torch.tensor(4 * [lateral, transversal, transversal], device=env.device)[:, None]
         self._columns = self._column_indices()
         self.shape = len(task.rewards), len(self._columns["newest"])
+        self._is_delayed = bool(self._columns["delayed"].any())
         self.read_parameters()
 
     def _column_indices(self) -> dict[str, torch.Tensor]:
@@ -293,7 +294,7 @@ class EnvGradients:
         numbers = wp.to_torch(self._skill.params.values)
         self._raw = [torch.where(begun[:, None], 0.0, past) for past in (raw.T, *self._raw[: RING - 1])]
         value = self._raw[0]
-        if bool(columns["delayed"].any()):
+        if self._is_delayed:
             value = torch.where(columns["delayed"] > 0, self._delayed(), value)
         scale = numbers[columns["scale"]]
         limit = scale.abs() * numbers[columns["clip"]]

@@ -165,6 +165,37 @@ def test_returns_of_flights_match_differences_with_the_policy_in_the_loop():
     assert 0.97 < ratio.median() < 1.03
 
 
+@pytest.mark.parametrize("name", ["vertical-jump", "vertical-jump-paper"])
+def test_gradients_of_observations_match_differences(name):
+    """With history (vertical-jump) or a sensor's latency (as in the paper), three policy steps after an action."""
+    env = Env(make_task(name), 24, seed=1, device="cpu")
+    env.reset()
+    start = env.state_dict()
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(env.num_obs, generator=generator)
+
+    def observed(first, gradients):
+        env.load_state_dict(start)
+        with env.gradients() if gradients else torch.no_grad():
+            for action in (first, *torch.zeros(2, 24, 12)):
+                obs = env.step(action).obs["actor"]
+        return (weights * obs).sum(1), env.done > 0.0
+
+    first = torch.zeros(24, 12, requires_grad=True)
+    total, ended = observed(first, gradients=True)
+    (gradient,) = torch.autograd.grad(total.sum(), first)
+    found, expected = [], []
+    for _ in range(6):
+        direction = 3.0e-3 * torch.randn(24, 12, generator=generator)
+        ends = [observed(sign * direction, gradients=False)[0].double() for sign in (1.0, -1.0)]
+        expected.append(0.5 * (ends[0] - ends[1]))
+        found.append((gradient * direction).sum(1).double())
+    found, expected = torch.stack(found)[:, ~ended], torch.stack(expected)[:, ~ended]
+    assert found.shape[1] >= 12
+    assert torch.nn.functional.cosine_similarity(found, expected, dim=0).median() > 0.99
+    assert 0.97 < ((found * expected).sum(0) / expected.square().sum(0)).median() < 1.03
+
+
 def test_gradients_by_weights_of_each_world_sum_to_the_gradient_of_the_total():
     net = network("vertical-jump")
     env = Env(make_task("vertical-jump"), 3, seed=1, device="cpu")
