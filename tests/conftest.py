@@ -49,6 +49,17 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def registered_tasks():
+    """Remove the tasks that a module's tests register, which other modules do not expect."""
+    from jumper_warp.registry import TASKS
+
+    before = dict(TASKS)
+    yield
+    TASKS.clear()
+    TASKS.update(before)
+
+
 @pytest.fixture(scope="module")
 def one_thread():
     """Limit torch to one thread during a module's tests, which is faster for small networks."""
