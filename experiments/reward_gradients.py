@@ -94,12 +94,11 @@ def simulated_returns(env: Env, rollout: Rollout, window: Window) -> Callable[[t
     default = env.robot.default_angle.numpy()[:, None]
     start = {name: rollout.array(getattr(window.start, name).cpu()) for name in ("q", "qd", "initial_target")}
     start["impulse"] = rollout.vectors(window.start.impulse.cpu())
-    wrench = [wp.to_torch(env.robot.body_f).view(n, -1, 6)[:, 0].T for _ in window.arrays]
 
     def simulate(actions: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulate the window with these actions."""
         targets = actions.cpu().numpy().astype(np.float64).transpose(0, 2, 1) * scale + default
-        jump = rollout.run(targets, **start, wrench=rollout.array(torch.stack(wrench).cpu()))
+        jump = rollout.run(targets, **start)
         q, qd, torque, filtered = (getattr(jump, name).numpy() for name in ("q", "qd", "torque", "filtered_target"))
         force = jump.impulse.numpy() / rollout.dt
         total = np.zeros(n)
@@ -168,8 +167,7 @@ def main(args: Args) -> dict:
     results = {}
     for name in args.policies:
         policy = Policy.load(name)
-        task = policy.recipe().task
-        task = task.on_level_ground() if hasattr(task, "on_level_ground") else task
+        task = policy.recipe().task.on_level_ground()
         env = Env(task, args.num_envs, seed=args.seed, device=args.device, randomize=False, noise=False)
         env.reset()
         with env.gradients() as gradients, torch.no_grad():

@@ -211,6 +211,7 @@ class Env(Stages):
         self._reset_worlds(self._part(), mask)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
+        self._restart_gradients()
         return self._step.obs, {}
 
     @locked
@@ -262,11 +263,17 @@ class Env(Stages):
     def gradients(self) -> EnvGradients:
         """Return a context in which `step` returns rewards and the policy's observations with gradients, as tensors.
 
-        They reach back over the steps of the context to actions and to the state at its beginning; `restart` of the
-        context ends them at the current state. Values are the same as without gradients.
+        They reach back over the steps of the context to actions and to the state at its beginning, or at the last call
+        of `reset`, `evaluation_reset`, `load_state_dict` or the context's `restart`. Values are the same as without
+        gradients.
         Raises InputError (a ValueError): several tasks, another solver or moving blocks.
         """
         return EnvGradients(self)
+
+    def _restart_gradients(self) -> None:
+        """End the gradients of a context of `gradients` at the current state, which no step has made."""
+        if self.gradients_of_step is not None:
+            self.gradients_of_step.restart()
 
     def step_values(self, action: torch.Tensor, after_physics: Callable[[], None] | None = None) -> Step:
         """Advance one policy step without gradients; as `step` outside of `gradients`.
@@ -372,6 +379,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
         self.episodes.done.zero_()
+        self._restart_gradients()
 
     @locked
     def command(self, commands: Values, worlds: Values | None = None) -> None:
@@ -527,3 +535,4 @@ class Env(Stages):
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)
+        self._restart_gradients()

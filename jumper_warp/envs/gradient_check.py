@@ -71,14 +71,15 @@ class GradientCheck:
         A term whose value never changes has no gradient, which is no fault.
         """
         faults = {}
+        kinks = self.kinks()
         for name, (found, differences) in self.results().items():
             largest = np.abs(differences).max()
             if not np.isfinite(found).all():
                 faults[name] = "not finite"
             elif largest > ROUNDING and not found.any():
                 faults[name] = "zero everywhere, although the term changes"
-            elif (share := self.kinks()[name]) > 0.05:
-                faults[name] = f"differs from differences in {100.0 * share:.0f} % of the steps"
+            elif kinks[name] > 0.05:
+                faults[name] = f"differs from differences in {100.0 * kinks[name]:.0f} % of the steps"
         return faults
 
     def kinks(self) -> dict[str, float]:

@@ -138,7 +138,7 @@ class EnvGradients:
         self.env.gradients_of_step = None
 
     def restart(self) -> None:
-        """Begin at the environment's current state, without gradients, as after a reset or a command."""
+        """Begin at the environment's current state, without gradients; its resets call this."""
         self.read_parameters()
         self.state = self._state_of_env()
         self.simulated = self.state
@@ -194,8 +194,6 @@ class EnvGradients:
         terms, raw = _Terms.apply(self, self.arrays, kept, *inputs)
         self.simulated = end
         self.state = self._next_state(end, begun)
-        if self._randomizes:
-            self.read_parameters()
         obs = {**values.obs, "actor": values.obs["actor"] + self._observation(raw, begun)}
         return values._replace(obs=obs, reward=values.reward + self._reward(terms))
 

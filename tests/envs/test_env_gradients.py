@@ -32,12 +32,6 @@ def network(task):
     return Network(Policy.load(POLICIES[task]))
 
 
-def level(name):
-    """Return a task without moving blocks."""
-    task = make_task(name)
-    return task.on_level_ground() if hasattr(task, "on_level_ground") else task
-
-
 def steps_of(env, count, actions):
     """Yield the environment's steps with a policy's actions, at 0.9 of their size: none is at its limit."""
     obs = env.obs
@@ -51,7 +45,7 @@ def steps_of(env, count, actions):
 def test_values_are_bitwise_those_of_steps_without_gradients(name):
     """The worlds have random masses, friction, motors, offsets, latency, filter and pushes, in all phases of a jump."""
     act = network(name).act
-    env = Env(level(name), 6, seed=3, device="cpu")
+    env = Env(make_task(name).on_level_ground(), 6, seed=3, device="cpu")
     env.reset()
     start = env.state_dict()
     plain = [(step.reward.clone(), step.obs["actor"].clone()) for step in steps_of(env, 12, act)]
@@ -75,7 +69,7 @@ def test_values_are_bitwise_those_of_steps_without_gradients(name):
 def test_gradients_of_all_rewards_match_differences(name):
     """Within 1 % of a term's largest change; at most 5 % of the samples are at a kink."""
     act = network(name).act
-    env = Env(level(name), 13, seed=1, device="cpu")
+    env = Env(make_task(name).on_level_ground(), 13, seed=1, device="cpu")
     env.reset()
     with env.gradients() as gradients, torch.no_grad():
         check = GradientCheck(gradients)
@@ -225,6 +219,21 @@ def test_no_gradient_crosses_a_reset_or_restart():
         assert (gradient.abs().sum(1) > 0.0).tolist() == [True, False, True, True]
         gradients.restart()
         assert not env.step(torch.zeros(4, 12)).reward.requires_grad
+
+
+@pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "load_state_dict"])
+def test_a_reset_within_the_context_begins_at_its_state(begin):
+    env = Env(make_task("vertical-jump"), 4, seed=1, device="cpu")
+    env.reset()
+    start = env.state_dict()
+    arguments = {"reset": (), "evaluation_reset": ([0.0, 0.0, 0.9, 0.0],), "load_state_dict": (start,)}[begin]
+    with env.gradients() as gradients:
+        for _ in range(3):
+            env.step(torch.full((4, 12), 0.5).requires_grad_())
+        getattr(env, begin)(*arguments)
+        step = env.step(torch.zeros(4, 12))
+        assert not step.reward.requires_grad
+        torch.testing.assert_close(gradients.simulated.q, gradients.state.q, rtol=0.0, atol=1.0e-4)
 
 
 def test_second_derivatives_and_two_contexts_are_refused():
