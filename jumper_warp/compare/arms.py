@@ -39,9 +39,13 @@ class Member:
         """Saved configuration of the training. Raises InputError: it is unreadable."""
         path = self.folder / CONFIG
         config = read_json(path, "settings of a run or policy")
-        if not isinstance(config, dict) or not isinstance(config.get("train"), dict) or "seed" not in config["train"]:
-            raise InputError(f"{path}: no settings of a training")
-        return config
+        try:
+            numbers = (config["train"]["seed"], config["train"]["ppo"]["num_steps"] * config["train"]["num_envs"])
+            if flat_settings(config) and all(isinstance(number, int) for number in numbers):
+                return config
+        except (TypeError, ValueError, LookupError, AttributeError):
+            pass
+        raise InputError(f"{path}: no settings of a training")
 
     @property
     def seed(self) -> int:
@@ -74,7 +78,9 @@ class Member:
         train = self.config["train"]
         steps = train["ppo"]["num_steps"] * train["num_envs"]
         rows = [
-            (steps * line["iteration"], line[TIME], line[metric]) for line in self.log if line.get(metric) is not None
+            (steps * line["iteration"], line.get(TIME), line[metric])
+            for line in self.log
+            if line.get(metric) is not None
         ]
         return np.array(rows, dtype=float).reshape(-1, 3).T
 
@@ -124,9 +130,8 @@ class Arm:
         seed that does not reach it.
         """
         if share := STEPS_TO.fullmatch(metric):
-            return np.array(
-                [each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in self.members if each.log]
-            )
+            logged = (each for each in self.members if each.curve(self.best_metric).size)
+            return np.array([each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in logged])
         return np.array([member.last[metric] for member in self.members if metric in member.last])
 
     def curves(self, metric: str, axis: int, points: int = 100) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,8 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
 POLL = 2.0  # [s] Time between two looks at the trials of other workers
-FIXED = ("task", "flags", "seeds", "metric", "direction")  # Settings that all trials of a sweep share
+FIXED = ("task", "flags", "seeds", "metric", "direction", "parameters", "modules")
+"""Settings that all trials of a sweep share."""
 RUN, ALIVE, WORKER = "run", "alive", "worker"  # Attributes of a trial: name of its run, time of the last sign, process
 
 

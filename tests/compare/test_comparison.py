@@ -6,6 +6,7 @@ import pytest
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
 from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
+from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.utils.errors import InputError
 from saved_runs import save_run
@@ -184,3 +185,53 @@ def test_equal_values_of_all_seeds_are_noted(tmp_path):
             save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
     text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
     assert "**All seeds have the same Metrics/success**" in text
+
+
+def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
+    evaluated = []
+    run_episodes = EvaluationRun.run_episodes
+
+    def counted(run, *args, **settings):
+        evaluated.append(run)
+        return run_episodes(run, *args, **settings)
+
+    monkeypatch.setattr(EvaluationRun, "run_episodes", counted)
+    with pytest.raises(InputError, match=r"vertical_jump has no metric sucess_rate; there are .*success_rate"):
+        compare("vertical_jump", "mars_vertical_jump", primary="-sucess_rate", evaluation={"num_jumps": 4})
+    assert len(evaluated) == 1
+
+
+@pytest.mark.parametrize("name", ["a$b", "$x$$", r"$\frac$"])
+def test_names_and_titles_are_not_mathematics(runs, tmp_path, name):
+    comparison = compare(f"{name}={runs}/base", f"{name}b={runs}/tuck", evaluate=False, title=f"of {name}")
+    assert write_report(comparison, tmp_path).exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("train", {"seed": None}), ("train", {"seed": "x"}), ("train", {"seed": [1]}), ("train", {"ppo": {}}),
+        ("train", {"num_envs": "8"}), ("env", None), ("env", {"task": None}), ("env", {"task": "x"}),
+    ],
+)  # fmt: skip
+def test_damaged_settings_of_a_run_are_named(runs, section, values):
+    path = next(runs.glob("*_base")) / "config.json"
+    config = json.loads(path.read_text())
+    config[section] = values and config[section] | values
+    path.write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"config\.json: no settings of a training"):
+        compared(runs, "base", "tuck")
+
+
+def test_a_seed_without_the_metric_of_the_best_checkpoint_has_no_steps_to_a_share(runs, tmp_path):
+    path = next(runs.glob("*_base")) / METRICS_FILE
+    path.write_text('{"iteration": 10, "Metrics/success": null}\n{"iteration": 20}\n')
+    comparison = compared(runs, "base", "tuck", primary="-steps_to_80_percent")
+    assert len(comparison.primary[0].values) == 4
+    assert write_report(comparison, tmp_path).exists()
+
+
+def test_lines_of_metrics_without_a_time_have_no_curve_over_time(runs, tmp_path):
+    for folder in runs.glob("*_base"):
+        (folder / METRICS_FILE).write_text('{"iteration": 10, "Metrics/success": 0.5}\n')
+    assert write_report(compared(runs, "base", "tuck"), tmp_path).exists()

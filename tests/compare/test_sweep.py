@@ -7,7 +7,7 @@ import time
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
+from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, wait_for, work_on
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
@@ -69,11 +69,14 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
         ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
         ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
         ("--num-envs 8", "--num-envs 16", "flags was"),
+        ("high = 400.0", "high = 500.0", "parameters was"),
+        ("trials = 3", 'trials = 3\nmodules = ["my_task.py"]', r"modules was \[\], got \['my_task.py'\]"),
     ],
 )
 def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, message):
     path = sweep_file(tmp_path)
     open_study(read_sweep(path))
+    (tmp_path / "my_task.py").touch()
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=message):
         open_study(read_sweep(path))
@@ -216,3 +219,32 @@ def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old
     with pytest.raises(SystemExit):
         main(["sweep", str(path)])
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--workers", "0"), "workers must be a whole number"),
+        (("--workers", "2", "--slurm", "bogus=1"), "local: Parameter 'bogus'"),
+        (("--workers", "2", "--slurm", "timeout_min=x"), 'local: Parameter "timeout_min" expected type'),
+        (("--workers", "2", "--slurm", "nodes=2"), "local: LocalExecutor can use only one node"),
+        (("--cluster", "slurm"), 'slurm: Could not detect "srun"'),
+    ],
+)
+def test_a_setting_of_workers_that_cannot_be_used_is_named(tmp_path, capsys, flags, message):
+    pytest.importorskip("submitit")
+    with pytest.raises(SystemExit) as end:
+        main(["sweep", str(sweep_file(tmp_path)), *flags])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_sweep_ends_with_one_line_if_all_workers_fail(tmp_path, capsys):
+    submitit = pytest.importorskip("submitit")
+    executor = submitit.AutoExecutor(tmp_path, cluster="local")
+    works, fails = (executor.submit(int, text) for text in ("1", "x"))
+    wait_for([works, fails], cancel=False)
+    with pytest.raises(SystemExit) as end:
+        wait_for([fails], cancel=False)
+    assert end.value.code == 1
+    assert [line[:31] for line in capsys.readouterr().err.splitlines()] == ["jumper: a worker failed, see /t"] * 2
