@@ -46,7 +46,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.viz.recording import load_npz
 
     task = task_of(cfg.task)
-    recording = load_npz(cfg.recording.with_suffix(".npz"))
+    recording = load_npz(cfg.recording)
     recorded = str(recording.notes.get("task", ""))
     base = cfg.base or (recorded if recorded in TASKS and recorded != task.name else base_of(task))
     result = rescore(recording, task, make_task(base))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,6 @@ def test_a_plot_has_one_reward_term_of_all_motions_and_the_sum_comes_first(motio
 
 def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
     for name, recording in motions.items():
-        recording.save_npz(tmp_path / f"{name}.npz")
+        replace(recording, notes={"task": "vertical-jump"}).save_npz(tmp_path / f"{name}.npz")
     main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", "--out", str(tmp_path / "out")])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
