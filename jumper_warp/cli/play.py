@@ -108,6 +108,6 @@ def play_together(args: Sequence[str], modules: Sequence[ModuleType]) -> None:
     together = compare_motions(motions, tasks[0])
     together = replace(together, notes=together.notes | cfg.film.notes)
     path = write_rrd(together, folder / "motions.rrd")
-    print(write_pictures(together, folder / "motions.png", true_scale=cfg.film.true_scale, **cfg.film.view))
-    print(path, *([] if cfg.film.video is None else [cfg.film.write(together)]), sep="\n")
+    picture = write_pictures(together, folder / "motions.png", true_scale=cfg.film.true_scale, **cfg.film.view)
+    print(picture, path, *([] if cfg.film.video is None else [cfg.film.write(together)]), sep="\n")
     open_viewer(path, cfg.viewer)

@@ -57,10 +57,9 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sums = ("–" if value is None else f"{value:.4g}" for value in (row.base, row.task))
         ends = (f"{end + 0.0:.3g}" for end in (row.low, row.high))  # 0.0 makes 0 of -0
         table.add_row(row.term, *sums, f"{100.0 * row.nonzero:.0f} %", *ends)
-    print_table(table)
     write_metrics(folder, {f"sum_{row.term}": row.task for row in result.table}, {"task": task.name, "base": base})
     result.plot(folder / "rewards.png")
-    print(folder / "rewards.png")
     path = save_recording(result.with_lanes(), folder, cfg.recording.stem)
-    print(path)
+    print_table(table)
+    print(folder / "rewards.png", path, sep="\n")
     open_viewer(path, cfg.viewer)

@@ -30,6 +30,7 @@ from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.catalog import ERRORS, SUCCESSES
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.checks import check_flags
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
@@ -154,6 +155,7 @@ def compare(
     user's task modules.
     Raises InputError: fewer than two arms, or see `find_arms`; PolicyError: a policy cannot be evaluated.
     """
+    check_flags(evaluate=evaluate)
     arms = of_equal_length(find_arms(sources))
     if len(arms) < 2:
         names = ", ".join(arm.name for arm in arms)

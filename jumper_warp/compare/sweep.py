@@ -198,6 +198,10 @@ class TrialReport(Observer):
         self._sweep = sweep
         self._reported = 0  # Last reported iteration
 
+    def begin(self, runs: Sequence[TrainingRun]) -> None:
+        """Raise InputError: the trainings do not log the metric."""
+        runs[0].check_logged("metric", self._sweep.metric)
+
     def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
         """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
         from optuna.exceptions import TrialPruned

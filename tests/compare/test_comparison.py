@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from jumper_warp.cli.main import main
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
 from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
@@ -235,3 +236,13 @@ def test_lines_of_metrics_without_a_time_have_no_curve_over_time(runs, tmp_path)
     for folder in runs.glob("*_base"):
         (folder / METRICS_FILE).write_text('{"iteration": 10, "Metrics/success": 0.5}\n')
     assert write_report(compared(runs, "base", "tuck"), tmp_path).exists()
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_page(runs, tmp_path, closed_pipe):
+    main(["compare", str(runs / "base"), str(runs / "tuck"), "--no-evaluate", "--out", str(tmp_path / "out")])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {PICTURE, PAGE, DATA}
+
+
+def test_whether_to_evaluate_is_a_flag(runs):
+    with pytest.raises(InputError, match="evaluate must be True or False, got 'no'"):
+        compare(runs / "base", runs / "tuck", evaluate="no")

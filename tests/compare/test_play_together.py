@@ -56,3 +56,11 @@ def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
         replace(recording, notes={"task": "vertical-jump"}).save_npz(tmp_path / f"{name}.npz")
     main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", "--out", str(tmp_path / "out")])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_film(motions, tmp_path, closed_pipe):
+    for name, recording in motions.items():
+        recording.save_npz(tmp_path / f"{name}.npz")
+    film = ["--video", str(tmp_path / "film.gif"), "--out", str(tmp_path / "out")]
+    main(["play", f"{tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
+    assert (tmp_path / "film.gif").exists()

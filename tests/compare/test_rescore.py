@@ -125,3 +125,10 @@ def test_a_path_that_is_no_recording_is_refused(tmp_path, capsys, path):
     with pytest.raises(SystemExit) as end:
         main(["rescore", path, "--task", "vertical-jump"])
     assert (end.value.code, len(capsys.readouterr().err.splitlines())) == (2, 1)
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_results(recording, tmp_path, closed_pipe):
+    recording.save_npz(tmp_path / "recorded.npz")
+    main(["rescore", f"{tmp_path}/recorded.rrd", "--task", "vertical-jump", "--out", str(tmp_path / "out")])
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"rewards.png", "metrics.json", "recorded.rrd"} <= names

@@ -210,7 +210,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("startup_trials = 2", 'name = "../up"', "name may contain"),
         ("sqlite", "sqlite:////none/none.db", "unable to open"),
         ("sqlite", "other", "Could not parse"),
-        ("Train/mean_episode_length", "Train/mean_episode", "has not logged Train/mean_episode at its end; it logged"),
+        ("Train/mean_episode_length", "Train/mean_episode", "metric must name a logged metric, such as"),
     ],
 )
 def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old, new, message):
