@@ -67,13 +67,3 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture
-def closed_pipe(monkeypatch):
-    """Make standard output a pipe whose reader has closed it, as `head` does."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    with open(writer, "w", buffering=1, encoding="utf-8") as file:
-        monkeypatch.setattr("sys.stdout", file)
-        yield

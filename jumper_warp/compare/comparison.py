@@ -199,7 +199,7 @@ def _evaluate(
             own = test if run.task.state is test.state else run.task
             try:
                 flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
-            except TypeError as error:
+            except (TypeError, ValueError) as error:
                 raise InputError(f"evaluation: {error}") from error
             run.conditions = conditions
             changed = partial(_with_terminations, own)

@@ -108,6 +108,7 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
     the settings FIXED.
     """
     import optuna
+    from optuna.exceptions import StorageInternalError
     from optuna.storages.journal import JournalFileBackend, JournalStorage
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -133,7 +134,7 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
                 raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
             study.set_user_attr(name, value)
         return study
-    except (ImportError, ValueError, SQLAlchemyError) as error:
+    except (ImportError, ValueError, SQLAlchemyError, StorageInternalError) as error:
         raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
 

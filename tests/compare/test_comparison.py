@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from closed_pipe import closed_pipe
 from jumper_warp.cli.main import main
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
@@ -238,11 +239,17 @@ def test_lines_of_metrics_without_a_time_have_no_curve_over_time(runs, tmp_path)
     assert write_report(compared(runs, "base", "tuck"), tmp_path).exists()
 
 
-def test_a_reader_that_closes_the_pipe_does_not_lose_the_page(runs, tmp_path, closed_pipe):
-    main(["compare", str(runs / "base"), str(runs / "tuck"), "--no-evaluate", "--out", str(tmp_path / "out")])
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_page(runs, tmp_path):
+    with closed_pipe():
+        main(["compare", str(runs / "base"), str(runs / "tuck"), "--no-evaluate", "--out", str(tmp_path / "out")])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {PICTURE, PAGE, DATA}
 
 
 def test_whether_to_evaluate_is_a_flag(runs):
     with pytest.raises(InputError, match="evaluate must be True or False, got 'no'"):
         compare(runs / "base", runs / "tuck", evaluate="no")
+
+
+def test_a_flag_of_the_evaluation_of_another_shape_is_refused():
+    with pytest.raises(InputError, match="evaluation: too many values"):
+        compare("vertical_jump", "mars_vertical_jump", evaluation={"height_range": (1.0, 2.0, 3.0)})

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from closed_pipe import closed_pipe
 from jump_helpers import make_env, random_actions
 from jumper_warp.cli.main import main
 from jumper_warp.compare.motions import compare_motions
@@ -58,9 +59,10 @@ def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
 
 
-def test_a_reader_that_closes_the_pipe_does_not_lose_the_film(motions, tmp_path, closed_pipe):
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_film(motions, tmp_path):
     for name, recording in motions.items():
         recording.save_npz(tmp_path / f"{name}.npz")
     film = ["--video", str(tmp_path / "film.gif"), "--out", str(tmp_path / "out")]
-    main(["play", f"{tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
+    with closed_pipe():
+        main(["play", f"{tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
     assert (tmp_path / "film.gif").exists()

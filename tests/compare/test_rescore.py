@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from closed_pipe import closed_pipe
 from jump_helpers import make_env, random_actions
 from jumper_warp import mdp
 from jumper_warp.cli.main import main
@@ -127,8 +128,9 @@ def test_a_path_that_is_no_recording_is_refused(tmp_path, capsys, path):
     assert (end.value.code, len(capsys.readouterr().err.splitlines())) == (2, 1)
 
 
-def test_a_reader_that_closes_the_pipe_does_not_lose_the_results(recording, tmp_path, closed_pipe):
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_results(recording, tmp_path):
     recording.save_npz(tmp_path / "recorded.npz")
-    main(["rescore", f"{tmp_path}/recorded.rrd", "--task", "vertical-jump", "--out", str(tmp_path / "out")])
+    with closed_pipe():
+        main(["rescore", f"{tmp_path}/recorded.rrd", "--task", "vertical-jump", "--out", str(tmp_path / "out")])
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"rewards.png", "metrics.json", "recorded.rrd"} <= names

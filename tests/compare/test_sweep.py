@@ -201,6 +201,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("{ low = 1, high = 3 }", "{ low = nan, high = 3.0 }", "ppo.epochs must be finite"),
         ("{ low = 1, high = 3 }", "{ low = 1.0, high = inf }", "ppo.epochs must be finite"),
         ("ppo.epochs", "seeds", "sets --seeds"),
+        ("ppo.epochs", "device", "no device '"),
         ("--num-envs 8", "--run_name=x", "sets --run-name"),
         ("--num-envs 8", "--num-envs '8", "No closing quotation"),
         ("startup_trials = 2", "startup_trials = -1", "startup trials cannot be negative"),
@@ -248,3 +249,11 @@ def test_a_sweep_ends_with_one_line_if_all_workers_fail(tmp_path, capsys):
         wait_for([fails], cancel=False)
     assert end.value.code == 1
     assert [line[:31] for line in capsys.readouterr().err.splitlines()] == ["jumper: a worker failed, see /t"] * 2
+
+
+def test_a_storage_that_cannot_be_written_is_named(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    open_study(sweep)
+    storage = f"sqlite:///file:{sweep.folder}/study.db?mode=ro&uri=true"
+    with pytest.raises(InputError, match="sweep two_settings: "):
+        open_study(read_sweep(sweep_file(tmp_path, storage=storage)))
