@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from jumper_warp.compare.sweep import Sweep
     from jumper_warp.recipe import Recipe
 
+GPUS = "CUDA_VISIBLE_DEVICES"
+
 
 @dataclass(frozen=True)
 class SweepCfg:
@@ -77,11 +79,14 @@ def submit(cfg: SweepCfg, folder: Path) -> list:
     except (AssertionError, NameError, RuntimeError, ValueError) as error:
         raise InputError(f"{cfg.cluster}: {error}") from error
     stderr = os.dup(2)
+    interrupt = signal.signal(signal.SIGINT, signal.default_int_handler)  # else a worker of `sweep ... &` ignores it
     with (folder / "workers" / "controllers.log").open("ab") as log:
         os.dup2(log.fileno(), 2)  # of submitit's controllers, which print a traceback when they are interrupted
     try:
-        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+        gpus = [os.environ.get(GPUS)] * cfg.workers
+        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers), gpus)
     finally:
+        signal.signal(signal.SIGINT, interrupt)
         os.dup2(stderr, 2)
         os.close(stderr)
 
@@ -118,8 +123,14 @@ def number(text: str) -> object:
         return text
 
 
-def work_on(file: Path, worker: int = 0) -> None:
-    """Run trials of a sweep in this process until all are done; worker: its index."""
+def work_on(file: Path, worker: int = 0, gpus: str | None = "") -> None:
+    """Run trials of a sweep in this process until all are done.
+
+    worker: index of the process. gpus: value of GPUS in place of "", which submitit's local executor sets to hide all.
+    """
+    if os.environ.get(GPUS) == "":
+        del os.environ[GPUS]
+        os.environ |= {} if gpus is None else {GPUS: gpus}
     from jumper_warp.compare.sweep import work
 
     work(read_sweep(file), recipe_of, worker)

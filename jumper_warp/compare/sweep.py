@@ -134,7 +134,10 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
                 raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
             study.set_user_attr(name, value)
         return study
-    except (ImportError, ValueError, SQLAlchemyError, StorageInternalError) as error:
+    except (
+        ImportError, ValueError, SQLAlchemyError, StorageInternalError,
+        LookupError, TypeError, AssertionError,  # of a damaged journal
+    ) as error:  # fmt: skip
         raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, wait_for, work_on
+from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, wait_for, work_on
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
@@ -257,3 +257,34 @@ def test_a_storage_that_cannot_be_written_is_named(tmp_path):
     storage = f"sqlite:///file:{sweep.folder}/study.db?mode=ro&uri=true"
     with pytest.raises(InputError, match="sweep two_settings: "):
         open_study(read_sweep(sweep_file(tmp_path, storage=storage)))
+
+
+@pytest.mark.parametrize("line", ["{}", "[]", '{"op_code": 99, "worker_id": "a"}', "null", "x"])
+def test_a_damaged_journal_is_refused(tmp_path, line):
+    sweep = read_sweep(sweep_file(tmp_path, storage="journal"))
+    sweep.folder.mkdir()
+    (sweep.folder / "journal.log").write_text(f"{line}\n{line}\n")
+    with pytest.raises(InputError, match="sweep two_settings: "):
+        open_study(sweep)
+
+
+@pytest.mark.parametrize("gpus", [None, "", "3"])
+def test_a_worker_sees_the_gpus_of_its_parent_and_does_not_ignore_ctrl_c(tmp_path, monkeypatch, gpus):
+    """As it would in a script's `jumper sweep FILE --workers 2 &`; submitit hides all GPUs."""
+    pytest.importorskip("submitit")
+    (tmp_path / "seen_by_worker.py").write_text(f"""
+import os, pathlib, signal
+seen = [os.environ.get("CUDA_VISIBLE_DEVICES"), signal.getsignal(signal.SIGINT) == signal.SIG_IGN]
+pathlib.Path("{tmp_path}/seen").write_text(str(seen))
+raise SystemExit
+""")
+    monkeypatch.delenv(GPUS, raising=False)
+    if gpus is not None:
+        monkeypatch.setenv(GPUS, gpus)
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        (job,) = submit(SweepCfg(sweep_file(tmp_path, more='modules = ["seen_by_worker.py"]')), tmp_path)
+        job.wait()
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert (tmp_path / "seen").read_text() == str([gpus, False])
