@@ -6,6 +6,7 @@ import fnmatch
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -39,12 +40,10 @@ class Member:
         """Saved configuration of the training. Raises InputError: it is unreadable."""
         path = self.folder / CONFIG
         config = read_json(path, "settings of a run or policy")
-        try:
+        with suppress(TypeError, ValueError, LookupError, AttributeError):
             numbers = (config["train"]["seed"], config["train"]["ppo"]["num_steps"] * config["train"]["num_envs"])
             if flat_settings(config) and all(isinstance(number, int) for number in numbers):
                 return config
-        except (TypeError, ValueError, LookupError, AttributeError):
-            pass
         raise InputError(f"{path}: no settings of a training")
 
     @property
@@ -77,11 +76,8 @@ class Member:
         """Return policy steps of all worlds, training time [s] and value of a metric, (3, logged iterations)."""
         train = self.config["train"]
         steps = train["ppo"]["num_steps"] * train["num_envs"]
-        rows = [
-            (steps * line["iteration"], line.get(TIME), line[metric])
-            for line in self.log
-            if line.get(metric) is not None
-        ]
+        logged = [line for line in self.log if line.get(metric) is not None]
+        rows = [(steps * line["iteration"], line.get(TIME), line[metric]) for line in logged]
         return np.array(rows, dtype=float).reshape(-1, 3).T
 
     def steps_to(self, metric: str, share: float) -> float:

@@ -167,8 +167,7 @@ def compare(
     evaluated: list[Values] = [{} for _ in arms]
     if evaluate:
         test = EvaluationRun(arms[0].members[0].folder, modules).task
-        metric_name = primary.removeprefix("-")
-        evaluated = [_evaluate(arm, test, evaluation or {}, conditions, modules, metric_name) for arm in arms]
+        evaluated = [_evaluate(arm, test, evaluation or {}, conditions, modules, primary) for arm in arms]
     curve_metric = metric or arms[0].best_metric
     known = [name for name in PRIMARY if all(name.removeprefix("-") in values for values in evaluated)]
     shown = {} if not evaluate else {**dataclasses.asdict(conditions), **(evaluation or {})}
@@ -185,12 +184,12 @@ def _metric_of(arm: Arm, evaluated: Mapping[str, Any], metric: str) -> Any:
 
 def _evaluate(
     arm: Arm, test: TaskCfg, evaluation: Mapping[str, Any], conditions: Conditions, modules: Sequence[ModuleType],
-    metric: str,
+    primary: str,
 ) -> Values:  # fmt: skip
     """Return the metrics of all seeds of an arm in the evaluation of `jumper evaluate`, without undefined ones.
 
     test: task of the base, whose commands and terminations all arms of the same kind of task have. Raises InputError
-    after the first seed that has no `metric`, unless it is empty.
+    after the first seed without the metric `primary`, unless it is empty.
     """
     rows = []
     with phase(f"evaluating {arm.name}", len(arm.members)) as advance:
@@ -206,8 +205,8 @@ def _evaluate(
             log = flags.log(changed(run.task), conditions.stream_seed)
             metrics = flags.metrics(run.run_episodes(run.env(log.count, changed), log))
             rows.append({name: each.value for name, each in metrics.items() if isinstance(each.value, int | float)})
-            if metric:
-                _metric_of(arm, rows[-1], metric)
+            if primary:
+                _metric_of(arm, rows[-1], primary.removeprefix("-"))
             advance()
     names = [name for name in rows[0] if all(name in row for row in rows)]
     return {name: np.array([row[name] for row in rows], dtype=float) for name in names}

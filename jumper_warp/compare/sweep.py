@@ -28,7 +28,7 @@ from jumper_warp.rl.runner import Observer
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.checks import NAME, check_count, check_finite, check_not_negative, check_types
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json
+from jumper_warp.utils.files import Json, directory_lock
 
 POLL = 2.0  # [s] Time between two looks at the trials of other workers
 FIXED = ("task", "flags", "seeds", "metric", "direction", "parameters", "modules")
@@ -108,36 +108,32 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
     the settings FIXED.
     """
     import optuna
-    from optuna.exceptions import StorageInternalError
     from optuna.storages.journal import JournalFileBackend, JournalStorage
-    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sweep.folder.mkdir(parents=True, exist_ok=True)
     storage: Any = sweep.storage
     try:
-        if storage == "sqlite":
-            storage = optuna.storages.RDBStorage(
-                f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
-            )
-        elif storage == "journal":
-            storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
-        pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
-        sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
-        study = optuna.create_study(
-            study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
-            sampler=sampler,
-        )  # fmt: skip
-        for name in FIXED:
-            value = json.loads(json.dumps(getattr(sweep, name)))
-            if (saved := study.user_attrs.get(name, value)) != value:
-                raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
-            study.set_user_attr(name, value)
-        return study
-    except (
-        ImportError, ValueError, SQLAlchemyError, StorageInternalError,
-        LookupError, TypeError, AssertionError,  # of a damaged journal
-    ) as error:  # fmt: skip
+        with directory_lock(sweep.folder):  # workers that start together would create the tables twice
+            if storage == "sqlite":
+                storage = optuna.storages.RDBStorage(
+                    f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
+                )
+            elif storage == "journal":
+                storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
+            pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
+            sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
+            study = optuna.create_study(
+                study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
+                sampler=sampler,
+            )  # fmt: skip
+            for name in FIXED:
+                value = json.loads(json.dumps(getattr(sweep, name)))
+                if (saved := study.user_attrs.get(name, value)) != value:
+                    raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
+                study.set_user_attr(name, value)
+            return study
+    except Exception as error:  # of Optuna, of the storage, or of a damaged journal
         raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
 

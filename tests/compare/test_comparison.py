@@ -124,7 +124,10 @@ def test_policies_are_evaluated_with_changed_flags():
     assert any(row.metric == "apex_error_abs_mean_m" for row in comparison.exploratory)
 
 
-@pytest.mark.parametrize("line", [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}'])
+@pytest.mark.parametrize(
+    "line",
+    [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}', b'{"iteration": 3, "a": 1e308}'],
+)
 def test_a_malformed_line_of_metrics_is_named(runs, line):
     folder = save_run(runs.parent, "base", 3, [0.9], start=7)
     (folder / METRICS_FILE).write_bytes(line + b"\n")

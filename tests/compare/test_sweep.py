@@ -3,6 +3,7 @@ import signal
 import socket
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -288,3 +289,11 @@ raise SystemExit
     finally:
         signal.signal(signal.SIGINT, previous)
     assert (tmp_path / "seen").read_text() == str([gpus, False])
+
+
+@pytest.mark.parametrize("storage", ["sqlite", "journal"])
+def test_workers_that_start_together_share_one_new_study(tmp_path, storage):
+    sweep = read_sweep(sweep_file(tmp_path, storage=storage))
+    with ThreadPoolExecutor(6) as pool:
+        studies = list(pool.map(lambda worker: open_study(sweep, worker), range(6)))
+    assert len({study._study_id for study in studies}) == 1
