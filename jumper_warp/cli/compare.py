@@ -86,8 +86,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         *sources, metric=cfg.metric, primary=cfg.primary, evaluate=cfg.evaluate, conditions=cfg.conditions,
         modules=modules, evaluation=with_tuples(settings.evaluation), title=settings.title,
     )  # fmt: skip
-    print("\n".join(lines(comparison)))
-    print(write_report(comparison, cfg.out, html=cfg.html))
+    page = write_report(comparison, cfg.out, html=cfg.html)  # first, since a reader such as head may close the pipe
+    print(*lines(comparison), page, sep="\n")
 
 
 def train_file(settings: ArmsFile) -> list[str]:

@@ -98,7 +98,7 @@ def dispatch(args: Sequence[str]) -> None:
     if name not in COMMANDS:
         near = suggestion(name, COMMANDS) or f"; there are {', '.join(COMMANDS)}"
         raise UsageError(f"no command {name!r:.60}{near}")
-    check_not_empty(args)
+    check_words(args)
     rest, files = split_task_modules(args[1:])
     modules = []
     try:
@@ -115,9 +115,14 @@ def dispatch(args: Sequence[str]) -> None:
         raise
 
 
-def check_not_empty(args: Sequence[str]) -> None:
-    """Raise UsageError if an argument is empty, such as an unset variable of a shell, or the value after `--flag=`."""
+def check_words(args: Sequence[str]) -> None:
+    """Raise UsageError if an argument is empty, such as an unset variable of a shell, or the value after `--flag=`.
+
+    Also if one is not UTF-8, which JSON, the format of saved command lines, cannot hold.
+    """
     for before, arg in itertools.pairwise(["jumper", *args]):
+        if arg.encode(errors="replace").decode() != arg:
+            raise UsageError(f"{arg!a:.60} is not UTF-8")
         flag, equals, value = arg.partition("=")
         if not arg or (flag.startswith("--") and equals and not value):
             raise UsageError(f"empty value of {flag}" if arg else f"empty value after {before}")
@@ -173,7 +178,7 @@ def parse(
     Raises InputError: a setting is out of range. Exits with 2 and tyro's message: there is no such flag, or a value is
     missing or of another type.
     """
-    check_not_empty(args)
+    check_words(args)
     import tyro
 
     from jumper_warp.cli.flags import TASK_MODULE_FLAG, check_numbers, list_flags, print_help, wants_help
@@ -228,11 +233,12 @@ def run_command(command: Callable[[], object]) -> None:
         raise SystemExit(USAGE_ERROR) from None
     except OSError as error:
         no_folder = "temporary directory" in str(error)  # of Python's tempfile, which names those that it tried
-        if error.filename is None and error.errno not in FULL and not no_folder:
+        if error.filename is None and error.errno not in (*FULL, errno.ENOENT) and not no_folder:
             raise
-        if error.filename is None and not no_folder:
+        if error.filename is None and error.errno in FULL:
             discard_output()
-        place = error.filename or ("TMPDIR" if no_folder else "standard output or an open file")
+        nameless = "working directory" if error.errno == errno.ENOENT else "standard output or an open file"
+        place = error.filename or ("TMPDIR" if no_folder else nameless)
         print_error(f"{place}: {error.strerror}")
         raise SystemExit(USAGE_ERROR) from None
     except (MemoryError, RuntimeError) as error:

@@ -93,21 +93,21 @@ def play_together(args: Sequence[str], modules: Sequence[ModuleType]) -> None:
     for source in sources:
         name, _, path = source.rpartition("=")
         if Path(path).suffix in (".rrd", ".npz"):
-            recording = load_npz(Path(path).with_suffix(".npz"))
-            tasks.append(task_of(str(recording.notes["task"])))
+            recording = load_npz(Path(path))
+            tasks.append(task_of(str(recording.notes.get("task", ""))))
         else:
             run = open_run(str(newest_run(path)), modules, flags)
             cfg = parse("play", run.task, [path, *flags], PlayCfg)
             folder = folder or output_dir("play", cfg.out)
             _, recording = record(run, replace(cfg, out=folder))
             tasks.append(run.task)
-        name = name or str(recording.notes["policy"])
+        name = name or str(recording.notes.get("policy", Path(path).stem))
         motions[f"{name} {len(motions) + 1}" if name in motions else name] = recording
     cfg = cfg or parse_flags(RecordingCfg, "play A B", flags)
     folder = folder or output_dir("play", cfg.out)
     together = compare_motions(motions, tasks[0])
     together = replace(together, notes=together.notes | cfg.film.notes)
     path = write_rrd(together, folder / "motions.rrd")
-    print(write_pictures(together, folder / "motions.png", true_scale=cfg.film.true_scale, **cfg.film.view))
-    print(path, *([] if cfg.film.video is None else [cfg.film.write(together)]), sep="\n")
+    picture = write_pictures(together, folder / "motions.png", true_scale=cfg.film.true_scale, **cfg.film.view)
+    print(picture, path, *([] if cfg.film.video is None else [cfg.film.write(together)]), sep="\n")
     open_viewer(path, cfg.viewer)

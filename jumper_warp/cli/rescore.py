@@ -46,7 +46,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.viz.recording import load_npz
 
     task = task_of(cfg.task)
-    recording = load_npz(cfg.recording.with_suffix(".npz"))
+    recording = load_npz(cfg.recording)
     recorded = str(recording.notes.get("task", ""))
     base = cfg.base or (recorded if recorded in TASKS and recorded != task.name else base_of(task))
     result = rescore(recording, task, make_task(base))
@@ -57,10 +57,9 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sums = ("–" if value is None else f"{value:.4g}" for value in (row.base, row.task))
         ends = (f"{end + 0.0:.3g}" for end in (row.low, row.high))  # 0.0 makes 0 of -0
         table.add_row(row.term, *sums, f"{100.0 * row.nonzero:.0f} %", *ends)
-    print_table(table)
     write_metrics(folder, {f"sum_{row.term}": row.task for row in result.table}, {"task": task.name, "base": base})
     result.plot(folder / "rewards.png")
-    print(folder / "rewards.png")
     path = save_recording(result.with_lanes(), folder, cfg.recording.stem)
-    print(path)
+    print_table(table)
+    print(folder / "rewards.png", path, sep="\n")
     open_viewer(path, cfg.viewer)

@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from jumper_warp.cli.compare import read_settings
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.main import FAULT, parse, print_error
 from jumper_warp.registry import load_task_module
+from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
     from jumper_warp.compare.sweep import Sweep
     from jumper_warp.recipe import Recipe
+
+GPUS = "CUDA_VISIBLE_DEVICES"
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     sweep.distributions()
     recipe_of(sweep.arguments({}, "checked"))
     if not cfg.report:
-        if cfg.workers == 1:
+        if check_count("workers", cfg.workers) == 1 and cfg.cluster == "local":
             work_on(cfg.file)
         else:
             wait_for(submit(cfg, sweep.folder), cancel=cfg.cluster == "local")
@@ -63,34 +66,53 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def submit(cfg: SweepCfg, folder: Path) -> list:
-    """Start the workers as jobs of submitit, and return them; their logs are in the sweep's folder."""
+    """Start the workers as jobs of submitit, and return them; their logs are in the sweep's folder.
+
+    Raises InputError: a setting of submitit is invalid, or there is no such cluster.
+    """
     import submitit
 
-    executor = submitit.AutoExecutor(folder / "workers", cluster=cfg.cluster)
     pairs = (setting.partition("=")[::2] for setting in cfg.slurm)
-    executor.update_parameters(**{"timeout_min": 24 * 60, **{name: number(value) for name, value in pairs}})
+    try:
+        executor = submitit.AutoExecutor(folder / "workers", cluster=cfg.cluster)
+        executor.update_parameters(**{"timeout_min": 24 * 60, **{name: number(value) for name, value in pairs}})
+    except (AssertionError, NameError, RuntimeError, ValueError) as error:
+        raise InputError(f"{cfg.cluster}: {error}") from error
     stderr = os.dup(2)
+    interrupt = signal.signal(signal.SIGINT, signal.default_int_handler)  # else a worker of `sweep ... &` ignores it
     with (folder / "workers" / "controllers.log").open("ab") as log:
         os.dup2(log.fileno(), 2)  # of submitit's controllers, which print a traceback when they are interrupted
     try:
-        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+        gpus = [os.environ.get(GPUS)] * cfg.workers
+        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers), gpus)
     finally:
+        signal.signal(signal.SIGINT, interrupt)
         os.dup2(stderr, 2)
         os.close(stderr)
 
 
 def wait_for(jobs: Sequence[Any], *, cancel: bool) -> None:
-    """Wait for jobs of submitit; if cancel, Ctrl-C, SIGTERM or SIGHUP ends them, and then this process."""
+    """Wait for jobs of submitit; if cancel, Ctrl-C, SIGTERM or SIGHUP ends them, and then this process.
+
+    Other workers continue the trials of one that fails. Exits with FAULT if all fail.
+    """
     for each in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(each) is signal.SIG_DFL:  # not with nohup
             signal.signal(each, lambda number, _: sys.exit(128 + number))
+    failures = 0
     try:
         for job in jobs:
-            job.result()
+            try:
+                job.result()
+            except RuntimeError:  # submitit's, with the worker's traceback, or without a result of a killed worker
+                failures += 1
+                print_error(f"a worker failed, see {job.paths.stderr}")
     except (KeyboardInterrupt, SystemExit):
         for job in jobs if cancel else ():
             job.cancel()
         raise
+    if failures == len(jobs):
+        raise SystemExit(FAULT)
 
 
 def number(text: str) -> object:
@@ -101,8 +123,14 @@ def number(text: str) -> object:
         return text
 
 
-def work_on(file: Path, worker: int = 0) -> None:
-    """Run trials of a sweep in this process until all are done; worker: its index."""
+def work_on(file: Path, worker: int = 0, gpus: str | None = "") -> None:
+    """Run trials of a sweep in this process until all are done.
+
+    worker: index of the process. gpus: value of GPUS in place of "", which submitit's local executor sets to hide all.
+    """
+    if os.environ.get(GPUS) == "":
+        del os.environ[GPUS]
+        os.environ |= {} if gpus is None else {GPUS: gpus}
     from jumper_warp.compare.sweep import work
 
     work(read_sweep(file), recipe_of, worker)

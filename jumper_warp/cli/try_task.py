@@ -46,16 +46,16 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.compare.report import plot, print_side_by_side
     from jumper_warp.compare.tasks import base_of, task_of
     from jumper_warp.compare.training import train_arm
-    from jumper_warp.registry import TASKS
+    from jumper_warp.registry import TASKS, find_task
     from jumper_warp.rl.cfg import PpoCfg
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
 
     task = task_of(cfg.task)
-    base = cfg.base or base_of(task)
+    base, entry = find_task(cfg.base or base_of(task))
     cpu = configure_device(cfg.device).driver is None
     folder = output_dir("try", cfg.out)
-    flags = [*short_flags(TASKS[base].presets.get("laptop", DEFAULT), cfg, cpu), "--log-root", str(folder)]
+    flags = [*short_flags(entry.presets.get("laptop", DEFAULT), cfg, cpu), "--log-root", str(folder)]
     recipe, _ = parse_train([base, *flags, "--run-name", "base"])
     changed, _ = parse_train([task.name, *flags, "--run-name", "change"])
     if TASKS[task.name].ppo == PpoCfg():  # the file names no settings of PPO: those of the base apply
@@ -63,8 +63,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         changed = dataclasses.replace(changed, train=train)
     runs = [f"{each.train.run_name}={train_arm(each)}" for each in (recipe, changed)]
     comparison = compare(*runs, evaluate=False, title=f"{task.name} (change) and {base} (base), short trainings")
-    print_side_by_side(comparison)
     plot(comparison, folder / "try.png", verdict=False)
+    print_side_by_side(comparison)
     print(folder / "try.png")
 
 
@@ -72,8 +72,8 @@ def short_flags(preset: str, cfg: TryCfg, cpu: bool) -> list[str]:
     """Return the flags of `jumper train` for a short training; preset: flags of a long one on a CPU."""
     seeds = ["--seeds", *map(str, cfg.seeds), "--log-interval", "1", "--no-tensorboard"]
     seeds += [] if cfg.device is None else ["--device", cfg.device]
-    iterations = ["--max-iterations", str(cfg.max_iterations)] if cfg.max_iterations else []
-    worlds = ["--num-envs", str(cfg.num_envs)] if cfg.num_envs else []
+    iterations = [] if cfg.max_iterations is None else ["--max-iterations", str(cfg.max_iterations)]
+    worlds = [] if cfg.num_envs is None else ["--num-envs", str(cfg.num_envs)]
     if not cpu:
         return [*seeds, *(iterations or ["--max-seconds", str(SECONDS)]), *worlds]
     words = shlex.split(preset)

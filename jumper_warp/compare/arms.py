@@ -6,6 +6,7 @@ import fnmatch
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -39,9 +40,11 @@ class Member:
         """Saved configuration of the training. Raises InputError: it is unreadable."""
         path = self.folder / CONFIG
         config = read_json(path, "settings of a run or policy")
-        if not isinstance(config, dict) or not isinstance(config.get("train"), dict) or "seed" not in config["train"]:
-            raise InputError(f"{path}: no settings of a training")
-        return config
+        with suppress(TypeError, ValueError, LookupError, AttributeError):
+            numbers = (config["train"]["seed"], config["train"]["ppo"]["num_steps"] * config["train"]["num_envs"])
+            if flat_settings(config) and all(isinstance(number, int) for number in numbers):
+                return config
+        raise InputError(f"{path}: no settings of a training")
 
     @property
     def seed(self) -> int:
@@ -73,9 +76,8 @@ class Member:
         """Return policy steps of all worlds, training time [s] and value of a metric, (3, logged iterations)."""
         train = self.config["train"]
         steps = train["ppo"]["num_steps"] * train["num_envs"]
-        rows = [
-            (steps * line["iteration"], line[TIME], line[metric]) for line in self.log if line.get(metric) is not None
-        ]
+        logged = [line for line in self.log if line.get(metric) is not None]
+        rows = [(steps * line["iteration"], line.get(TIME), line[metric]) for line in logged]
         return np.array(rows, dtype=float).reshape(-1, 3).T
 
     def steps_to(self, metric: str, share: float) -> float:
@@ -124,9 +126,8 @@ class Arm:
         seed that does not reach it.
         """
         if share := STEPS_TO.fullmatch(metric):
-            return np.array(
-                [each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in self.members if each.log]
-            )
+            logged = (each for each in self.members if each.curve(self.best_metric).size)
+            return np.array([each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in logged])
         return np.array([member.last[metric] for member in self.members if metric in member.last])
 
     def curves(self, metric: str, axis: int, points: int = 100) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,7 @@ from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.catalog import ERRORS, SUCCESSES
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.checks import check_flags
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
@@ -115,11 +116,7 @@ class Comparison:
 
     def values_of(self, arm: int, metric: str) -> np.ndarray:
         """Return a metric of the evaluation, else of the log, of an arm's seeds. Raises InputError: none has it."""
-        values = self.evaluated[arm].get(metric, self.arms[arm].last(metric))
-        if not len(values):
-            known = self.evaluated[arm] or self.arms[arm].members[0].last or ["no metrics in it"]
-            raise InputError(f"{self.arms[arm].name} has no metric {metric}; there are {', '.join(known)}")
-        return values
+        return _metric_of(self.arms[arm], self.evaluated[arm], metric)
 
     def _rows(self, names: Sequence[str], values: Callable[[int, str], np.ndarray]) -> list[Row]:
         """Return the rows of metrics, metric after metric, without tests; values: of an arm's seeds by its index."""
@@ -158,6 +155,7 @@ def compare(
     user's task modules.
     Raises InputError: fewer than two arms, or see `find_arms`; PolicyError: a policy cannot be evaluated.
     """
+    check_flags(evaluate=evaluate)
     arms = of_equal_length(find_arms(sources))
     if len(arms) < 2:
         names = ", ".join(arm.name for arm in arms)
@@ -169,19 +167,29 @@ def compare(
     evaluated: list[Values] = [{} for _ in arms]
     if evaluate:
         test = EvaluationRun(arms[0].members[0].folder, modules).task
-        evaluated = [_evaluate(arm, test, evaluation or {}, conditions, modules) for arm in arms]
+        evaluated = [_evaluate(arm, test, evaluation or {}, conditions, modules, primary) for arm in arms]
     curve_metric = metric or arms[0].best_metric
     known = [name for name in PRIMARY if all(name.removeprefix("-") in values for values in evaluated)]
     shown = {} if not evaluate else {**dataclasses.asdict(conditions), **(evaluation or {})}
     return Comparison(arms, tuple(evaluated), curve_metric, primary or next(iter(known), curve_metric), shown, title)
 
 
+def _metric_of(arm: Arm, evaluated: Mapping[str, Any], metric: str) -> Any:
+    """Return a metric of an arm's evaluation, else the last logged one. Raises InputError: there is none."""
+    if metric not in evaluated and not len(arm.last(metric)):
+        known = evaluated or arm.members[0].last or ["no metrics in it"]
+        raise InputError(f"{arm.name} has no metric {metric}; there are {', '.join(known)}")
+    return evaluated.get(metric, arm.last(metric))
+
+
 def _evaluate(
-    arm: Arm, test: TaskCfg, evaluation: Mapping[str, Any], conditions: Conditions, modules: Sequence[ModuleType]
-) -> Values:
+    arm: Arm, test: TaskCfg, evaluation: Mapping[str, Any], conditions: Conditions, modules: Sequence[ModuleType],
+    primary: str,
+) -> Values:  # fmt: skip
     """Return the metrics of all seeds of an arm in the evaluation of `jumper evaluate`, without undefined ones.
 
-    test: task of the base, whose commands and terminations all arms of the same kind of task have.
+    test: task of the base, whose commands and terminations all arms of the same kind of task have. Raises InputError
+    after the first seed without the metric `primary`, unless it is empty.
     """
     rows = []
     with phase(f"evaluating {arm.name}", len(arm.members)) as advance:
@@ -190,13 +198,15 @@ def _evaluate(
             own = test if run.task.state is test.state else run.task
             try:
                 flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
-            except TypeError as error:
+            except (TypeError, ValueError) as error:
                 raise InputError(f"evaluation: {error}") from error
             run.conditions = conditions
             changed = partial(_with_terminations, own)
             log = flags.log(changed(run.task), conditions.stream_seed)
             metrics = flags.metrics(run.run_episodes(run.env(log.count, changed), log))
             rows.append({name: each.value for name, each in metrics.items() if isinstance(each.value, int | float)})
+            if primary:
+                _metric_of(arm, rows[-1], primary.removeprefix("-"))
             advance()
     names = [name for name in rows[0] if all(name in row for row in rows)]
     return {name: np.array([row[name] for row in rows], dtype=float) for name in names}

@@ -105,7 +105,7 @@ def plot_rows(axis: Any, rows: Sequence[Row], arms: Sequence[str]) -> None:
         interval = np.abs(np.array(row.interval) - row.mean)[:, None]
         axis.errorbar(row.mean, index, xerr=interval, fmt="D", color=f"C{index}", capsize=4.0, markersize=7.0)
     axis.set(yticks=range(len(arms)), ylim=(len(arms) - 0.5, -0.5), xlabel=f"{words(rows[0].metric)}, grey: seeds")
-    axis.set_yticklabels(arms)
+    axis.set_yticklabels(arms, parse_math=False)
 
 
 def plot_terms(axis: Any, rows: Sequence[Row], arms: Sequence[str]) -> None:

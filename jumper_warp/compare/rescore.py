@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.motion import TERMINATION, set_motion
+from jumper_warp.evaluation.motion import ROBOT_STATES, TERMINATION, set_motion
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
@@ -100,7 +100,7 @@ def rescore(recording: Recording | Path | str, task: TaskCfg, base: TaskCfg) -> 
     Raises InputError: it has no complete states.
     """
     if not isinstance(recording, Recording):
-        recording = load_npz(Path(recording).with_suffix(".npz"))
+        recording = load_npz(Path(recording))
     terms, base_terms = (reward_terms(recording, each) for each in (task, base))
     return Rescored(recording, task.name, base.name, terms, base_terms, running_steps(recording))
 
@@ -116,16 +116,23 @@ def reward_terms(recording: Recording, task: TaskCfg) -> dict[str, np.ndarray]:
 
     Raises InputError: the recording has no complete states.
     """
-    if not recording.motion:
+    if not {TERMINATION, *ROBOT_STATES} <= recording.motion.keys():
         raise InputError("the recording has no complete states; jumper play writes them beside the .rrd file")
     running = running_steps(recording)
+    before_end = running & (recording.motion[TERMINATION] < 0)
+    for name in ROBOT_STATES:
+        if not np.isfinite(recording.motion[name][before_end]).all():
+            raise InputError(f"the recorded {name} is not finite")
     frames, worlds = running.shape
     with phase(f"rewards of {task.name}", frames) as advance:
         env = Env(task, worlds, device="cpu", randomize=False, noise=False, auto_reset=False)
         episode = env.stages()["episode"]
         steps = []
         for frame in range(frames):
-            set_motion(env, recording.motion, frame)
+            try:
+                set_motion(env, recording.motion, frame)
+            except (AttributeError, ValueError) as error:
+                raise InputError(f"the recorded states are of another shape: {error}") from error
             episode()
             steps.append({name: values.numpy().copy() for name, values in env.reward_terms.items()})
             advance()

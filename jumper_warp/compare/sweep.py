@@ -28,10 +28,11 @@ from jumper_warp.rl.runner import Observer
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.checks import NAME, check_count, check_finite, check_not_negative, check_types
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json
+from jumper_warp.utils.files import Json, directory_lock
 
 POLL = 2.0  # [s] Time between two looks at the trials of other workers
-FIXED = ("task", "flags", "seeds", "metric", "direction")  # Settings that all trials of a sweep share
+FIXED = ("task", "flags", "seeds", "metric", "direction", "parameters", "modules")
+"""Settings that all trials of a sweep share."""
 RUN, ALIVE, WORKER = "run", "alive", "worker"  # Attributes of a trial: name of its run, time of the last sign, process
 
 
@@ -108,31 +109,31 @@ def open_study(sweep: Sweep, worker: int = 0) -> Any:
     """
     import optuna
     from optuna.storages.journal import JournalFileBackend, JournalStorage
-    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sweep.folder.mkdir(parents=True, exist_ok=True)
     storage: Any = sweep.storage
     try:
-        if storage == "sqlite":
-            storage = optuna.storages.RDBStorage(
-                f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
-            )
-        elif storage == "journal":
-            storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
-        pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
-        sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
-        study = optuna.create_study(
-            study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
-            sampler=sampler,
-        )  # fmt: skip
-        for name in FIXED:
-            value = json.loads(json.dumps(getattr(sweep, name)))
-            if (saved := study.user_attrs.get(name, value)) != value:
-                raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
-            study.set_user_attr(name, value)
-        return study
-    except (ImportError, ValueError, SQLAlchemyError) as error:
+        with directory_lock(sweep.folder):  # workers that start together would create the tables twice
+            if storage == "sqlite":
+                storage = optuna.storages.RDBStorage(
+                    f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
+                )
+            elif storage == "journal":
+                storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
+            pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
+            sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
+            study = optuna.create_study(
+                study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
+                sampler=sampler,
+            )  # fmt: skip
+            for name in FIXED:
+                value = json.loads(json.dumps(getattr(sweep, name)))
+                if (saved := study.user_attrs.get(name, value)) != value:
+                    raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
+                study.set_user_attr(name, value)
+            return study
+    except Exception as error:  # of Optuna, of the storage, or of a damaged journal
         raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
 
@@ -196,6 +197,10 @@ class TrialReport(Observer):
         self._trial = trial
         self._sweep = sweep
         self._reported = 0  # Last reported iteration
+
+    def begin(self, runs: Sequence[TrainingRun]) -> None:
+        """Raise InputError: the trainings do not log the metric."""
+        runs[0].check_logged("metric", self._sweep.metric)
 
     def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
         """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""

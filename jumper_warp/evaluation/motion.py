@@ -23,14 +23,15 @@ SKIPPED = (
     "step_dt",
 )  # Members of `RobotArrays` that terms do not read, or constant
 ROBOT, STATE, TERMINATION = "robot.", "state.", "termination"  # Begins of the keys, and key of the termination's index
+ROBOT_STATES = tuple(ROBOT + name for name in RobotArrays.vars if name not in SKIPPED)  # Keys of the robot's arrays
 
 
 def robot_state(env: Env, worlds: Sequence[int]) -> dict[str, np.ndarray]:
     """Return the arrays of `RobotView`, and the termination's index (-1: none), of some worlds, (worlds, ...) each."""
     state = {TERMINATION: env.episodes.termination.numpy()[list(worlds)].copy()}
-    for name in RobotArrays.vars:
-        if name not in SKIPPED:
-            state[ROBOT + name] = _by_world(name, getattr(env.robot, name).numpy(), env.num_envs)[list(worlds)].copy()
+    for key in ROBOT_STATES:
+        name = key.removeprefix(ROBOT)
+        state[key] = _by_world(name, getattr(env.robot, name).numpy(), env.num_envs)[list(worlds)].copy()
     return state
 
 

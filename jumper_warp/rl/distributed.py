@@ -85,7 +85,10 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
     threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises InputError: there is no such device, or a
     variable is missing or invalid.
     """
-    selected = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    try:
+        selected = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    except RuntimeError as error:
+        raise InputError(f"no device {device!r:.60} ({error!s:.100})") from error
     if selected.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device {device} requested, but torch finds no GPU")
     size = torchrun_variable("WORLD_SIZE")

@@ -11,6 +11,7 @@ from pathlib import Path
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, existing_file, parse_json, read_file, write_atomically
 
+MOST = 1.0e300  # Bound of logged values, of which means are finite
 METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object per logged iteration
 
 
@@ -72,7 +73,8 @@ def logged_line(line: bytes) -> Json:
     with suppress(InputError):
         metrics = parse_json(line, METRICS_FILE)
         if isinstance(metrics, dict) and isinstance(metrics.get("iteration"), int):
-            return metrics if all(isinstance(value, int | float | None) for value in metrics.values()) else {}
+            numbers = [0.0 if value is None else value for value in metrics.values()]
+            return metrics if all(isinstance(each, int | float) and abs(each) < MOST for each in numbers) else {}
     return {}
 
 

@@ -62,10 +62,8 @@ class TrainingRun:
         self.stream = nullcontext() if stream is None else stream
         self.ppo = make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in STATISTICS}
-        logged = {*env.metrics(), *losses, *LEARNING, *PERF}
-        if cfg.best_metric not in logged:
-            examples = ", ".join(sorted(name for name in logged if name.startswith(("Metrics/", "Train/"))))
-            raise InputError(f"best_metric must name a logged metric, such as {examples}, got {cfg.best_metric!r:.60}")
+        self._logged = {*env.metrics(), *losses, *LEARNING, *PERF}  # Names of the logged metrics
+        self.check_logged("best_metric", cfg.best_metric)
         self.config = full_config(cfg, env, rank)
         self.iteration = 0
         self.ended = False
@@ -95,6 +93,12 @@ class TrainingRun:
         self._console = console
         if rank.index == 0:
             write_config(self.folder, self.config)
+
+    def check_logged(self, name: str, metric: str) -> None:
+        """Raise InputError, which begins with `name`, unless this training logs a metric."""
+        if metric not in self._logged:
+            examples = ", ".join(sorted(each for each in self._logged if each.startswith(("Metrics/", "Train/"))))
+            raise InputError(f"{name} must name a logged metric, such as {examples}, got {metric!r:.60}")
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
         """Restore networks, environment and random generators from a checkpoint; return its run's folder.

@@ -116,7 +116,7 @@ def git_commit() -> Commit | None:
 
 def _git(folder: Path, *arguments: str) -> str | None:
     """Return git's standard output for the tree in `folder`, or None if it fails or is not installed."""
-    command = ["git", "-C", str(folder), *arguments]
+    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]  # the user's git may run at the same time
     try:
         result = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=30, check=False)
     except (OSError, subprocess.TimeoutExpired):

@@ -38,13 +38,15 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
     with plt.style.context(STYLE):
         fig, axes = plt.subplots(*shape, layout="compressed", **settings)
         lines = [title, *textwrap.wrap(conditions, int(10.5 * fig.get_figwidth()))]
-        fig.suptitle("\n".join(filter(None, lines)), x=0.01, horizontalalignment="left")
+        fig.suptitle("\n".join(filter(None, lines)), x=0.01, horizontalalignment="left", parse_math=False)
         yield axes
         shown = [axis.get_legend_handles_labels() for axis in fig.axes if axis.get_legend() is None]
         entries = {label: handle for handles, labels in shown for handle, label in zip(handles, labels, strict=True)}
         if entries:
             columns = int(fig.get_figwidth() / (0.55 + 0.076 * max(map(len, entries))))
-            fig.legend(entries.values(), entries.keys(), loc="outside lower left", ncols=max(columns, 1))
+            legend = fig.legend(entries.values(), entries.keys(), loc="outside lower left", ncols=max(columns, 1))
+            for text in legend.get_texts():
+                text.set_parse_math(False)  # a name may contain $
         data = io.BytesIO()
         fig.savefig(data, format=Path(path).suffix[1:])
         plt.close(fig)

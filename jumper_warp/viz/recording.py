@@ -121,9 +121,10 @@ class Recording:
 def load_npz(path: Path) -> Recording:
     """Load a recording from a file written by `Recording.save_npz`.
 
-    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version, or an
-    entry has another type or shape.
+    path: of the archive, or of the .rrd file beside it. Raises RecordingError (an InputError): the file is missing,
+    damaged, of another kind or of another version, or an entry has another type or shape.
     """
+    path = Path(path).with_suffix(".npz") if Path(path).suffix == ".rrd" else Path(path)
     archive = read_npz(path, "recording", RecordingError)
     try:
         header = parse_json(str(archive["header"]), "header")

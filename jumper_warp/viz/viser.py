@@ -14,6 +14,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from jumper_warp.utils.checks import check_number
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.props import RING_HEIGHT, RING_RADIUS, RING_WIDTH
 from jumper_warp.viz.shapes import CHECKER_CELL, ShapeMesh
@@ -97,8 +98,9 @@ def open_server(port: int) -> ViserServer:
     """Start a viser server on the loopback address and return it; port: the next free one is used if it is taken.
 
     Pages of other origins and requests for a public tunnel are refused, which viser itself accepts.
-    Raises InputError: viser is not installed.
+    Raises InputError: viser is not installed, or there is no such port.
     """
+    check_number("port", port, 0, 65535)
     try:
         import viser
         import websockets.asyncio.server as websocket_server

@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import shutil
 import subprocess
 import sys
@@ -70,6 +71,7 @@ def still(tmp_path_factory):
         (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.02, 600], got 0.001"),
         (["train", "vertical-jump", "--init-policy="], "empty value of --init-policy"),
         (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "empty value after --log-root"),
+        (["evaluate", "vertical_jump", "--out", "\udcff"], "'\\udcff' is not UTF-8"),
         (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.02, 600], got 0.006"),
         (["evaluate", "horizontal_jump", "--suite", "grid", "--rows", "9999"], "columns, rows and num_jumps must be"),
     ],
@@ -79,6 +81,15 @@ def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkey
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0] and not list(tmp_path.iterdir())
+
+
+def test_a_deleted_working_directory_is_named(capsys, tmp_path, monkeypatch):
+    (tmp_path / "deleted").mkdir()
+    monkeypatch.chdir(tmp_path / "deleted")
+    (tmp_path / "deleted").rmdir()
+    with pytest.raises(SystemExit):
+        cli.run_command(os.getcwd)
+    assert capsys.readouterr().err == "jumper: working directory: No such file or directory\n"
 
 
 def test_flag_of_a_duration_may_be_infinite_for_never(capsys):

@@ -3,9 +3,12 @@ import json
 import numpy as np
 import pytest
 
+from closed_pipe import closed_pipe
+from jumper_warp.cli.main import main
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
 from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
+from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.utils.errors import InputError
 from saved_runs import save_run
@@ -121,7 +124,10 @@ def test_policies_are_evaluated_with_changed_flags():
     assert any(row.metric == "apex_error_abs_mean_m" for row in comparison.exploratory)
 
 
-@pytest.mark.parametrize("line", [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}'])
+@pytest.mark.parametrize(
+    "line",
+    [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}', b'{"iteration": 3, "a": 1e308}'],
+)
 def test_a_malformed_line_of_metrics_is_named(runs, line):
     folder = save_run(runs.parent, "base", 3, [0.9], start=7)
     (folder / METRICS_FILE).write_bytes(line + b"\n")
@@ -184,3 +190,69 @@ def test_equal_values_of_all_seeds_are_noted(tmp_path):
             save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
     text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
     assert "**All seeds have the same Metrics/success**" in text
+
+
+def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
+    evaluated = []
+    run_episodes = EvaluationRun.run_episodes
+
+    def counted(run, *args, **settings):
+        evaluated.append(run)
+        return run_episodes(run, *args, **settings)
+
+    monkeypatch.setattr(EvaluationRun, "run_episodes", counted)
+    with pytest.raises(InputError, match=r"vertical_jump has no metric sucess_rate; there are .*success_rate"):
+        compare("vertical_jump", "mars_vertical_jump", primary="-sucess_rate", evaluation={"num_jumps": 4})
+    assert len(evaluated) == 1
+
+
+@pytest.mark.parametrize("name", ["a$b", "$x$$", r"$\frac$"])
+def test_names_and_titles_are_not_mathematics(runs, tmp_path, name):
+    comparison = compare(f"{name}={runs}/base", f"{name}b={runs}/tuck", evaluate=False, title=f"of {name}")
+    assert write_report(comparison, tmp_path).exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("train", {"seed": None}), ("train", {"seed": "x"}), ("train", {"seed": [1]}), ("train", {"ppo": {}}),
+        ("train", {"num_envs": "8"}), ("env", None), ("env", {"task": None}), ("env", {"task": "x"}),
+    ],
+)  # fmt: skip
+def test_damaged_settings_of_a_run_are_named(runs, section, values):
+    path = next(runs.glob("*_base")) / "config.json"
+    config = json.loads(path.read_text())
+    config[section] = values and config[section] | values
+    path.write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"config\.json: no settings of a training"):
+        compared(runs, "base", "tuck")
+
+
+def test_a_seed_without_the_metric_of_the_best_checkpoint_has_no_steps_to_a_share(runs, tmp_path):
+    path = next(runs.glob("*_base")) / METRICS_FILE
+    path.write_text('{"iteration": 10, "Metrics/success": null}\n{"iteration": 20}\n')
+    comparison = compared(runs, "base", "tuck", primary="-steps_to_80_percent")
+    assert len(comparison.primary[0].values) == 4
+    assert write_report(comparison, tmp_path).exists()
+
+
+def test_lines_of_metrics_without_a_time_have_no_curve_over_time(runs, tmp_path):
+    for folder in runs.glob("*_base"):
+        (folder / METRICS_FILE).write_text('{"iteration": 10, "Metrics/success": 0.5}\n')
+    assert write_report(compared(runs, "base", "tuck"), tmp_path).exists()
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_page(runs, tmp_path):
+    with closed_pipe():
+        main(["compare", str(runs / "base"), str(runs / "tuck"), "--no-evaluate", "--out", str(tmp_path / "out")])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {PICTURE, PAGE, DATA}
+
+
+def test_whether_to_evaluate_is_a_flag(runs):
+    with pytest.raises(InputError, match="evaluate must be True or False, got 'no'"):
+        compare(runs / "base", runs / "tuck", evaluate="no")
+
+
+def test_a_flag_of_the_evaluation_of_another_shape_is_refused():
+    with pytest.raises(InputError, match="evaluation: too many values"):
+        compare("vertical_jump", "mars_vertical_jump", evaluation={"height_range": (1.0, 2.0, 3.0)})

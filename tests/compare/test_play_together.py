@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from closed_pipe import closed_pipe
 from jump_helpers import make_env, random_actions
 from jumper_warp.cli.main import main
 from jumper_warp.compare.motions import compare_motions
@@ -51,6 +54,15 @@ def test_a_plot_has_one_reward_term_of_all_motions_and_the_sum_comes_first(motio
 
 def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
     for name, recording in motions.items():
-        recording.save_npz(tmp_path / f"{name}.npz")
+        replace(recording, notes={"task": "vertical-jump"}).save_npz(tmp_path / f"{name}.npz")
     main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", "--out", str(tmp_path / "out")])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_film(motions, tmp_path):
+    for name, recording in motions.items():
+        recording.save_npz(tmp_path / f"{name}.npz")
+    film = ["--video", str(tmp_path / "film.gif"), "--out", str(tmp_path / "out")]
+    with closed_pipe():
+        main(["play", f"{tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
+    assert (tmp_path / "film.gif").exists()

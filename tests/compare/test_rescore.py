@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from closed_pipe import closed_pipe
 from jump_helpers import make_env, random_actions
 from jumper_warp import mdp
 from jumper_warp.cli.main import main
@@ -101,3 +102,35 @@ def test_the_command_rescores_the_recording_of_a_policy(tmp_path, capsys):
     assert {"rewards.png", "jump.rrd", "jump.npz", "metrics.json"} <= {
         file.name for file in (tmp_path / "out").iterdir()
     }
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("robot.joint_q", lambda values: values * np.nan, r"the recorded robot\.joint_q is not finite"),
+        ("robot.joint_qd", None, "no complete states"),
+        ("termination", None, "no complete states"),
+        ("robot.joint_q", lambda values: np.repeat(values, 2, axis=2), "the recorded states are of another shape"),
+    ],
+)
+def test_damaged_states_are_refused(recording, key, change, message):
+    motion = {name: values for name, values in recording.motion.items() if name != key}
+    motion |= {key: change(recording.motion[key])} if change else {}
+    task = make_task("vertical-jump")
+    with pytest.raises(InputError, match=message):
+        rescore(replace(recording, motion=motion), task, task)
+
+
+@pytest.mark.parametrize("path", [".", "/", "folder"])
+def test_a_path_that_is_no_recording_is_refused(tmp_path, capsys, path):
+    with pytest.raises(SystemExit) as end:
+        main(["rescore", path, "--task", "vertical-jump"])
+    assert (end.value.code, len(capsys.readouterr().err.splitlines())) == (2, 1)
+
+
+def test_a_reader_that_closes_the_pipe_does_not_lose_the_results(recording, tmp_path):
+    recording.save_npz(tmp_path / "recorded.npz")
+    with closed_pipe():
+        main(["rescore", f"{tmp_path}/recorded.rrd", "--task", "vertical-jump", "--out", str(tmp_path / "out")])
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"rewards.png", "metrics.json", "recorded.rrd"} <= names

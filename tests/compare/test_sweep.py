@@ -3,11 +3,12 @@ import signal
 import socket
 import subprocess
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
+from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, wait_for, work_on
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
@@ -69,11 +70,14 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
         ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
         ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
         ("--num-envs 8", "--num-envs 16", "flags was"),
+        ("high = 400.0", "high = 500.0", "parameters was"),
+        ("trials = 3", 'trials = 3\nmodules = ["my_task.py"]', r"modules was \[\], got \['my_task.py'\]"),
     ],
 )
 def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, message):
     path = sweep_file(tmp_path)
     open_study(read_sweep(path))
+    (tmp_path / "my_task.py").touch()
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=message):
         open_study(read_sweep(path))
@@ -198,6 +202,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("{ low = 1, high = 3 }", "{ low = nan, high = 3.0 }", "ppo.epochs must be finite"),
         ("{ low = 1, high = 3 }", "{ low = 1.0, high = inf }", "ppo.epochs must be finite"),
         ("ppo.epochs", "seeds", "sets --seeds"),
+        ("ppo.epochs", "device", "no device '"),
         ("--num-envs 8", "--run_name=x", "sets --run-name"),
         ("--num-envs 8", "--num-envs '8", "No closing quotation"),
         ("startup_trials = 2", "startup_trials = -1", "startup trials cannot be negative"),
@@ -207,7 +212,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("startup_trials = 2", 'name = "../up"', "name may contain"),
         ("sqlite", "sqlite:////none/none.db", "unable to open"),
         ("sqlite", "other", "Could not parse"),
-        ("Train/mean_episode_length", "Train/mean_episode", "has not logged Train/mean_episode at its end; it logged"),
+        ("Train/mean_episode_length", "Train/mean_episode", "metric must name a logged metric, such as"),
     ],
 )
 def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old, new, message):
@@ -216,3 +221,79 @@ def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old
     with pytest.raises(SystemExit):
         main(["sweep", str(path)])
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--workers", "0"), "workers must be a whole number"),
+        (("--workers", "2", "--slurm", "bogus=1"), "local: Parameter 'bogus'"),
+        (("--workers", "2", "--slurm", "timeout_min=x"), 'local: Parameter "timeout_min" expected type'),
+        (("--workers", "2", "--slurm", "nodes=2"), "local: LocalExecutor can use only one node"),
+        (("--cluster", "slurm"), 'slurm: Could not detect "srun"'),
+    ],
+)
+def test_a_setting_of_workers_that_cannot_be_used_is_named(tmp_path, capsys, flags, message):
+    pytest.importorskip("submitit")
+    with pytest.raises(SystemExit) as end:
+        main(["sweep", str(sweep_file(tmp_path)), *flags])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_sweep_ends_with_one_line_if_all_workers_fail(tmp_path, capsys):
+    submitit = pytest.importorskip("submitit")
+    executor = submitit.AutoExecutor(tmp_path, cluster="local")
+    works, fails = (executor.submit(int, text) for text in ("1", "x"))
+    wait_for([works, fails], cancel=False)
+    with pytest.raises(SystemExit) as end:
+        wait_for([fails], cancel=False)
+    assert end.value.code == 1
+    assert [line[:31] for line in capsys.readouterr().err.splitlines()] == ["jumper: a worker failed, see /t"] * 2
+
+
+def test_a_storage_that_cannot_be_written_is_named(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    open_study(sweep)
+    storage = f"sqlite:///file:{sweep.folder}/study.db?mode=ro&uri=true"
+    with pytest.raises(InputError, match="sweep two_settings: "):
+        open_study(read_sweep(sweep_file(tmp_path, storage=storage)))
+
+
+@pytest.mark.parametrize("line", ["{}", "[]", '{"op_code": 99, "worker_id": "a"}', "null", "x"])
+def test_a_damaged_journal_is_refused(tmp_path, line):
+    sweep = read_sweep(sweep_file(tmp_path, storage="journal"))
+    sweep.folder.mkdir()
+    (sweep.folder / "journal.log").write_text(f"{line}\n{line}\n")
+    with pytest.raises(InputError, match="sweep two_settings: "):
+        open_study(sweep)
+
+
+@pytest.mark.parametrize("gpus", [None, "", "3"])
+def test_a_worker_sees_the_gpus_of_its_parent_and_does_not_ignore_ctrl_c(tmp_path, monkeypatch, gpus):
+    """As it would in a script's `jumper sweep FILE --workers 2 &`; submitit hides all GPUs."""
+    pytest.importorskip("submitit")
+    (tmp_path / "seen_by_worker.py").write_text(f"""
+import os, pathlib, signal
+seen = [os.environ.get("CUDA_VISIBLE_DEVICES"), signal.getsignal(signal.SIGINT) == signal.SIG_IGN]
+pathlib.Path("{tmp_path}/seen").write_text(str(seen))
+raise SystemExit
+""")
+    monkeypatch.delenv(GPUS, raising=False)
+    if gpus is not None:
+        monkeypatch.setenv(GPUS, gpus)
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        (job,) = submit(SweepCfg(sweep_file(tmp_path, more='modules = ["seen_by_worker.py"]')), tmp_path)
+        job.wait()
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert (tmp_path / "seen").read_text() == str([gpus, False])
+
+
+@pytest.mark.parametrize("storage", ["sqlite", "journal"])
+def test_workers_that_start_together_share_one_new_study(tmp_path, storage):
+    sweep = read_sweep(sweep_file(tmp_path, storage=storage))
+    with ThreadPoolExecutor(6) as pool:
+        studies = list(pool.map(lambda worker: open_study(sweep, worker), range(6)))
+    assert len({study._study_id for study in studies}) == 1

@@ -126,3 +126,17 @@ def test_try_prints_the_terms_of_a_change_and_its_base(tmp_path, capsys):
     assert float(row[2]) == pytest.approx(7.5 * float(row[1]), rel=0.05)
     assert (tmp_path / "out/try.png").exists()
     assert "not which task is better" in lines[-2]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--base", "vertical_jmp"), "unknown task 'vertical_jmp'"),
+        (("--num-envs", "0"), "num_envs must be"),
+        (("--max-iterations", "0"), "max_iterations must be"),
+    ],
+)
+def test_a_flag_of_try_that_cannot_be_used_is_named(tmp_path, capsys, flags, message):
+    with pytest.raises(SystemExit):
+        main(["try", "vertical-jump", "--device", "cpu", "--out", str(tmp_path), *flags])
+    assert message in capsys.readouterr().err

@@ -9,6 +9,7 @@ import pytest
 from drive_helpers import session_of
 from jumper_warp.evaluation.skills import SkillNames
 from jumper_warp.live.plots import Plots, series_of
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.viser import open_server
 
 
@@ -191,3 +192,9 @@ def test_undefined_commanded_values_are_absent_from_a_plot_and_do_not_set_its_ra
     assert (commanded["auto"], commanded["width"]) == (False, 0)
     assert "auto" not in base
     server.stop()
+
+
+@pytest.mark.parametrize("port", [-1, 65536])
+def test_a_port_out_of_range_is_refused(port):
+    with pytest.raises(InputError, match="port must be in 0 to 65535"):
+        open_server(port)
