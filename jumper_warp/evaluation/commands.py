@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Generic, Literal, TypeVar
@@ -160,6 +160,8 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
     rewards: bool = False  # Record the task's reward terms too; their kernel is compiled at the first use
+    controller: Literal["policy", "mpc"] = "policy"
+    """Controller of jumps: the policy, or whole-jump predictive control, which begins with the policy's jump."""
 
     def __post_init__(self) -> None:
         """Raise InputError for a length of the recording [s] out of range."""
@@ -201,7 +203,13 @@ def record(run: EvaluationRun, cfg: PlayCfg, live: Live | None = None) -> tuple[
     recorder = EnvRecorder(env, log, range(log.count), notes=notes, live=live and live.recording)
     seconds = cfg.seconds or cfg.flags.length
     stop = cfg.seconds is None
-    run_evaluation(run.policy.act, env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=stop)
+    act = run.policy.act
+    if cfg.controller == "mpc":
+        from jumper_warp.evaluation.predictive_control import PredictiveController
+
+        nominal = replace(cfg.conditions, randomize=False, noise=False, push_in_flight=False)
+        act = PredictiveController(env, run.policy, run.env(log.count, conditions=nominal)).act
+    run_evaluation(act, env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=stop)
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):
         warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from jumper_warp import kernels
 
 PACKAGES = (
-    "", ".actuation", ".dynamics", ".dynamics.adjoint", ".dynamics.legs", ".dynamics.world", ".kinematics", ".terrain",
+    "", ".actuation", ".dynamics", ".dynamics.adjoint", ".dynamics.legs", ".dynamics.world", ".jump", ".kinematics",
+    ".terrain",
 )  # fmt: skip
 """Packages within `jumper_warp.kernels` that `KernelModules` searches."""
 
@@ -57,6 +58,7 @@ class KernelModules:
         )
         from jumper_warp.kernels.dynamics.legs import advance_legs, rollout_legs
         from jumper_warp.kernels.dynamics.world import advance, rollout
+        from jumper_warp.kernels.jump import plan_cost
         from jumper_warp.kernels.kinematics import full_state, geometry
         from jumper_warp.kernels.terrain import ground
 

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.predictive_control import PredictiveController
+from jumper_warp.policies.policy import Policy
+from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.utils.errors import InputError
+
+WEAK = RobotOverlay({"saturation": (1.0, 1.0, 0.5, *(9 * (1.0,)))})  # Half the torque of the left front inner motor
+
+
+def robots(policy, overlay=None):
+    recipe = policy.recipe()
+    change = recipe.task.evaluation.prepare_task
+    return env_of_recipe(recipe, 1, Conditions(device="cpu"), change=change, robot=overlay)
+
+
+def jump(env, act, goal):
+    log = JumpLog(np.array([[goal]]), env.task.termination_names, headings=0.5)
+    run_evaluation(act, env, log)
+    return log
+
+
+def test_robot_with_a_weak_motor_is_rescued():
+    policy = Policy.load("horizontal_jump")
+    env = robots(policy, WEAK)
+    goal = (1.8, 0.0)
+    assert not jump(env, policy.act, goal).success.any()
+    controller = PredictiveController(env, policy, robots(policy, WEAK), scales=(1.0,), threads=1)
+    log = jump(env, controller.act, goal)
+    assert log.outcomes == "success"
+
+
+def test_state_of_the_robot_is_not_changed_and_assumed_parameters_stay():
+    policy = Policy.load("horizontal_jump")
+    env = robots(policy, WEAK)
+    assumed = robots(policy)
+    controller = PredictiveController(env, policy, assumed, scales=(1.0,), threads=1)
+    env.evaluation_reset([0.5, 0.0, 0.0, 0.0])
+    before = env.state_dict()
+    controller.begin()
+    controller._rests_with_policy()
+    after = env.state_dict()
+    assert all((before[name] == after[name]).all() for name in before)
+    assert assumed.snapshot().parameters["saturation"][2, 0] == 18.0
+    assert env.snapshot().parameters["saturation"][2, 0] == 9.0
+
+
+def test_policies_that_do_not_jump_are_rejected():
+    policy = Policy.load("walking_flat")
+    env = robots(policy)
+    with pytest.raises(InputError, match="needs a jump"):
+        PredictiveController(env, policy, env)
