@@ -199,11 +199,7 @@ def main(args: Args) -> dict:
                 values |= {f"{name}_identified_{key}": value for key, value in found.means().items()}
             announce(f"{name}, {mode}: {saved[mode].sum()} of {len(goals)} saved")
         if saved:
-            saveable = np.any(list(saved.values()), axis=0)
-            values[f"{name}_saveable_rate"] = float(saveable.mean())
             values |= {f"{name}_{mode}_saved_rate": float(row.mean()) for mode, row in saved.items()}
-            of = max(saveable.sum(), 1)
-            values |= {f"{name}_{mode}_saved_of_saveable_rate": float(row.sum() / of) for mode, row in saved.items()}
             shares[name] = [row.mean() for row in saved.values()]
         report(args, folder, values, f"Rescue of jumps with {', '.join(args.changes)}", [])
     with figure(folder / "rescue.png", title="Jumps that the policy loses and the controller saves") as axis:
