@@ -1,0 +1,218 @@
+// The page: it connects controls, worker and picture, and shows figures and messages.
+import { Controls } from "./controls.js";
+import { Scene } from "./scene.js";
+
+const PUSH = [70, 0.2]; // [N], [s] of the push key
+const AHEAD = 0.9; // [m] of the gamepad's jump ahead
+const HINT = matchMedia("(pointer: coarse)").matches
+  ? "Tap the ground: the robot jumps there."
+  : "Click the ground: the robot jumps there. <kbd>W</kbd><kbd>A</kbd><kbd>S</kbd><kbd>D</kbd> walk, <kbd>space</kbd> jumps up.";
+const PLANETS = { Earth: 9.81, Mars: 3.71, Moon: 1.62 };
+const $ = (id) => document.getElementById(id);
+const meters = (x, digits = 2) => `${x.toFixed(digits)} m`;
+
+const scene = new Scene($("view"));
+const worker = new Worker("physics.js", { type: "module" });
+const page = { scene, state: null, jumps: [], times: null }; // also for tests
+window.page = page;
+let name = "plain";
+let dark = (localStorage.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
+let info = null; // of the open scene
+let notice = 0; // timer of a message
+
+const send = (type, content = {}) => { if (info || type === "open") worker.postMessage({ type, ...content }); };
+
+// Show a message for some time [ms], then the hint again; 0: until the next one.
+function say(text, time = 6000, kind = "") {
+  clearTimeout(notice);
+  $("hint").innerHTML = text;
+  $("hint").className = kind;
+  if (time) notice = setTimeout(() => say(HINT, 0), time);
+}
+
+function distance([x, y]) {
+  const [px, py] = page.state.position;
+  return Math.hypot(x - px, y - py);
+}
+
+const within = (place) => distance(place) <= info.reach[1];
+
+const actions = {
+  walk: (velocity) => send("walk", { velocity }),
+  jumpUp: () => {
+    if (!info) return;
+    const height = Number($("height").value);
+    figure(`${meters(height)} asked`, "");
+    send("jumpUp", { height });
+  },
+  jumpTo: (place) => {
+    if (!info || page.state.fallen) return;
+    figure(`${meters(distance(place))} asked`, "");
+    if (!within(place)) say(`Too far for one jump of ${meters(info.reach[1], 1)}: it walks nearer first.`);
+    send("jumpTo", { goal: place });
+  },
+  jumpAhead: () => {
+    if (!info) return;
+    const { position: [x, y], yaw } = page.state;
+    actions.jumpTo([x + AHEAD * Math.cos(yaw), y + AHEAD * Math.sin(yaw)]);
+  },
+  push: () => {
+    const angle = 2 * Math.PI * Math.random();
+    send("push", { force: [PUSH[0] * Math.cos(angle), PUSH[0] * Math.sin(angle), 0], seconds: PUSH[1] });
+    say(`Pushed with ${PUSH[0]} N for ${PUSH[1]} s. You can also drag the robot.`, 3000);
+  },
+  drag: (target) => send("drag", { target }),
+  hover: (place) => scene.mark("hover", info ? place : null, info && place && within(place)),
+  reset: () => {
+    send("reset");
+    scene.showJump(null);
+    say(HINT, 0);
+  },
+};
+
+function figure(big, small) {
+  $("big").textContent = big;
+  $("small").textContent = small;
+}
+
+const receive = {
+  scene: (data) => {
+    info = data;
+    scene.setRobot(data.shapes);
+    scene.setGround(data.scene, dark);
+    const [low, high] = data.heights;
+    Object.assign($("height"), { min: Math.max(low, 0.5), max: high - 0.05 });
+    $("height").value = data.scene === "mars" ? 2.5 : 0.9;
+    $("height").oninput();
+    setSlider("gravity", data.gravity);
+    setSlider("friction", data.friction);
+    $("names").textContent = Object.values(data.policies).join(", ");
+    $("loading").hidden = true;
+    page.opened = data.scene;
+    say(HINT, 0);
+  },
+  state: (state) => {
+    if (state.fallen && !page.state?.fallen) say("It fell. It stands up in a moment; <kbd>R</kbd> resets at once.", 2500, "bad");
+    page.state = state;
+    scene.update(state.poses, 1000 / 60 / state.speed);
+    scene.mark("goal", state.goal, state.goal && within(state.goal));
+    if (state.skill === "jump_up" && state.phase === 1) page.top = Math.max(page.top ?? 0, state.height);
+  },
+  jump: (jump) => {
+    page.jumps.push(jump);
+    scene.showJump(jump);
+    if (!jump.made) figure("no jump", "It stayed on the ground.");
+    else if (jump.goal) figure(`${meters(Math.abs(jump.error), 3)} off`, `apex ${meters(jump.apex)}`);
+    else figure(meters(jump.apex, 3), `${meters(jump.height)} asked, ${meters(jump.apex, 3)} reached`);
+  },
+  times: (times) => { page.times = times; },
+  error: ({ text }) => {
+    $("loading").hidden = true;
+    say(text, 10000, "bad");
+  },
+};
+
+worker.onmessage = ({ data }) => receive[data.type](data);
+worker.onerror = () => receive.error({ text: "This browser cannot run the physics: it needs WebAssembly and module workers." });
+
+function open(next) {
+  name = next;
+  info = null;
+  $("loading").hidden = false;
+  figure("", "");
+  worker.postMessage({ type: "open", scene: name });
+}
+
+function setSlider(id, value) {
+  $(id).value = value;
+  $(id).oninput();
+}
+
+// Connect a slider to a value of the worker, and show it with its unit.
+function slider(id, text, send) {
+  $(id).oninput = () => { $(`${id}-value`).textContent = text(Number($(id).value)); };
+  $(id).addEventListener("input", () => send?.(Number($(id).value)));
+}
+
+const set = (key) => (value) => send("set", { name: key, value });
+slider("height", (x) => meters(x));
+slider("friction", (x) => x.toFixed(2), set("friction"));
+slider("payload", (x) => `${x.toFixed(1)} kg`, set("payload"));
+slider("speed", (x) => `${x.toFixed(2)} ×`, set("speed"));
+slider("gravity", (x) => {
+  const planet = Object.keys(PLANETS).find((key) => Math.abs(PLANETS[key] - x) < 0.06);
+  return planet ?? `${x.toFixed(1)} m/s²`;
+}, set("gravity"));
+for (const [planet, gravity] of Object.entries(PLANETS)) {
+  $(planet).onclick = () => {
+    setSlider("gravity", gravity);
+    set("gravity")(gravity);
+  };
+}
+$("scene").onchange = () => {
+  open($("scene").value);
+  $("scene").blur();
+};
+$("jump").onclick = actions.jumpUp;
+$("push").onclick = actions.push;
+$("reset").onclick = actions.reset;
+for (const button of document.querySelectorAll("button, input")) button.addEventListener("pointerup", () => button.blur());
+$("theme").onclick = () => {
+  dark = !dark;
+  localStorage.theme = dark ? "dark" : "light";
+  paint();
+};
+
+function paint() {
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  if (info) scene.setGround(name, dark);
+}
+
+// Run a policy of the visitor's own: files of a folder that `jumper export` wrote.
+async function take(files) {
+  const find = (ending) => files.find((file) => file.name === ending);
+  const [json, bin] = [find("policy.json"), find("policy.bin")];
+  if (!json || !bin) return say("This folder has no policy.json and policy.bin: export the policy again.", 10000, "bad");
+  try {
+    const description = JSON.parse(await json.text());
+    const bytes = await bin.arrayBuffer();
+    send("policy", { description, bytes, scene: name });
+  } catch {
+    say("policy.json is damaged: export the policy again.", 10000, "bad");
+  }
+}
+
+// Return the files of dropped files and folders.
+async function filesOf(items) {
+  const read = async (entry) => {
+    if (entry.isFile) return [await new Promise((resolve, reject) => { entry.file(resolve, reject); })];
+    const entries = await new Promise((resolve, reject) => { entry.createReader().readEntries(resolve, reject); });
+    return (await Promise.all(entries.map(read))).flat();
+  };
+  return (await Promise.all(items.map((item) => item.webkitGetAsEntry()).filter(Boolean).map(read))).flat();
+}
+
+addEventListener("dragover", (event) => event.preventDefault());
+addEventListener("drop", async (event) => {
+  event.preventDefault();
+  take(await filesOf([...event.dataTransfer.items]));
+});
+$("files").onchange = () => take([...$("files").files]);
+addEventListener("resize", () => scene.resize());
+const controls = new Controls(scene, $("stick"), actions);
+
+function frame(now) {
+  controls.poll();
+  scene.draw(now);
+  if (page.state && info) {
+    const { velocity, height, skill, phase, waiting } = page.state;
+    const speed = Math.hypot(velocity[0], velocity[1]);
+    const doing = skill === "walk" ? (waiting ? "gets ready" : speed > 0.05 ? "walks" : "stands") : phase === 1 ? "flies" : phase === 2 ? "lands" : "crouches";
+    $("status").textContent = `${doing} · ${height.toFixed(2)} m high · ${speed.toFixed(1)} m/s`;
+  }
+  requestAnimationFrame(frame);
+}
+
+paint();
+open(name);
+requestAnimationFrame(frame);
