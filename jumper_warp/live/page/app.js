@@ -4,6 +4,7 @@ import { Scene } from "./scene.js";
 
 const PUSH = [70, 0.2]; // [N], [s] of the push key
 const AHEAD = 0.9; // [m] of the gamepad's jump ahead
+const SLIP = 0.15; // [m/s] mean speed of the fastest paw on the ground from which a walk slips
 const HINT = matchMedia("(pointer: coarse)").matches
   ? "Tap the ground: the robot jumps there."
   : "Click the ground: the robot jumps there. <kbd>W</kbd><kbd>A</kbd><kbd>S</kbd><kbd>D</kbd> walk, <kbd>space</kbd> jumps up.";
@@ -18,6 +19,7 @@ window.page = page;
 let name = "plain";
 let dark = (localStorage.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
 let info = null; // of the open scene
+let top = 0; // [m] largest height of the flight so far
 let notice = 0; // timer of a message
 
 const send = (type, content = {}) => { if (info || type === "open") worker.postMessage({ type, ...content }); };
@@ -35,19 +37,20 @@ function distance([x, y]) {
   return Math.hypot(x - px, y - py);
 }
 
-const within = (place) => distance(place) <= info.reach[1];
+const within = (place) => distance(place) >= info.reach[0] && distance(place) <= info.reach[1];
 
 const actions = {
   walk: (velocity) => send("walk", { velocity }),
   jumpUp: () => {
     if (!info) return;
     const height = Number($("height").value);
-    figure(`${meters(height)} asked`, "");
+    figure("…", `${meters(height)} asked`);
     send("jumpUp", { height });
   },
   jumpTo: (place) => {
     if (!info || page.state.fallen) return;
-    figure(`${meters(distance(place))} asked`, "");
+    if (distance(place) < info.reach[0]) return say(`Too near: a jump ahead is at least ${meters(info.reach[0], 1)}.`, 3000);
+    figure("…", `${meters(distance(place))} away`);
     if (!within(place)) say(`Too far for one jump of ${meters(info.reach[1], 1)}: it walks nearer first.`);
     send("jumpTo", { goal: place });
   },
@@ -92,17 +95,19 @@ const receive = {
     say(HINT, 0);
   },
   state: (state) => {
+    state.slip = 0.9 * (page.state?.slip ?? 0) + 0.1 * state.slip;
     if (state.fallen && !page.state?.fallen) say("It fell. It stands up in a moment; <kbd>R</kbd> resets at once.", 2500, "bad");
+    top = state.phase === 1 ? Math.max(top, state.height) : 0;
+    if (top) figure(meters(top), $("small").textContent);
     page.state = state;
     scene.update(state.poses, 1000 / 60 / state.speed);
     scene.mark("goal", state.goal, state.goal && within(state.goal));
-    if (state.skill === "jump_up" && state.phase === 1) page.top = Math.max(page.top ?? 0, state.height);
   },
   jump: (jump) => {
     page.jumps.push(jump);
     scene.showJump(jump);
     if (!jump.made) figure("no jump", "It stayed on the ground.");
-    else if (jump.goal) figure(`${meters(Math.abs(jump.error), 3)} off`, `apex ${meters(jump.apex)}`);
+    else if (jump.goal) figure(`${(100 * jump.error).toFixed(1)} cm off`, `${meters(jump.length)} far, ${meters(jump.apex)} high`);
     else figure(meters(jump.apex, 3), `${meters(jump.height)} asked, ${meters(jump.apex, 3)} reached`);
   },
   times: (times) => { page.times = times; },
@@ -205,9 +210,9 @@ function frame(now) {
   controls.poll();
   scene.draw(now);
   if (page.state && info) {
-    const { velocity, height, skill, phase, waiting } = page.state;
+    const { velocity, height, skill, phase, waiting, slip } = page.state;
     const speed = Math.hypot(velocity[0], velocity[1]);
-    const doing = skill === "walk" ? (waiting ? "gets ready" : speed > 0.05 ? "walks" : "stands") : phase === 1 ? "flies" : phase === 2 ? "lands" : "crouches";
+    const doing = skill === "walk" ? (waiting ? "gets ready" : speed < 0.05 ? "stands" : slip > SLIP ? "slips" : "walks") : phase === 1 ? "flies" : phase === 2 ? "lands" : "crouches";
     $("status").textContent = `${doing} · ${height.toFixed(2)} m high · ${speed.toFixed(1)} m/s`;
   }
   requestAnimationFrame(frame);

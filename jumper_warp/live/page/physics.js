@@ -82,7 +82,7 @@ function step() {
   const poses = robot.poses(new Float32Array(7 * robot.model.nbody));
   post("state", {
     poses, skill: session.skill, phase: session.jump?.phase, position: Array.from(robot.position), yaw: robot.yaw,
-    height: robot.height, velocity: Array.from(robot.velocity), fallen: session.fallen, speed: values.speed,
+    height: robot.height, velocity: Array.from(robot.velocity), slip: robot.slip, fallen: session.fallen, speed: values.speed,
     goal: session.request?.goal ?? session.jump?.goal ?? null, waiting: session.request !== null,
   }, [poses.buffer]);
 }

@@ -55,6 +55,8 @@ export class Robot {
     this.data.qpos[2] += surface(this.scene, 0, 0);
     this.mujoco.mj_forward(this.model, this.data);
     this.contactTime = [0, 0, 0, 0];
+    this.places = [[0, 0], [0, 0], [0, 0], [0, 0]]; // [m] of the paws after the last policy step
+    this.slip = 0; // [m/s] largest speed of a paw on the ground
     this.push.fill(0);
   }
 
@@ -98,6 +100,10 @@ export class Robot {
     }
     const force = data.sensordata; // [N] of the paws
     const dt = SUBSTEPS * model.opt.timestep;
+    const places = this.paws.map((paw) => Array.from(data.geom_xpos.subarray(3 * paw, 3 * paw + 2)));
+    const speeds = places.map(([x, y], leg) => Math.hypot(x - this.places[leg][0], y - this.places[leg][1]) / dt);
+    this.slip = Math.max(...speeds.map((speed, leg) => (force[leg] > 0.1 && this.contactTime[leg] > 0 ? speed : 0)));
+    this.places = places;
     this.contactTime = this.contactTime.map((time, leg) => (force[leg] > 0.1 ? time + dt : 0));
   }
 

@@ -14,6 +14,8 @@ const COLORS = {
   marsDark: { sky: 0x2a1710, ground: ["#6b3a23", "#5f321e"], box: 0x8a4a2c, ambient: 0.8 },
 };
 const SLOW = 28; // [ms] time of a frame above which the resolution falls
+const LAG = 150; // [ms] of the camera behind a rising robot
+const LEAST = 0.4; // pixels a CSS pixel of the lowest resolution
 
 export class Scene {
   constructor(canvas) {
@@ -57,8 +59,12 @@ export class Scene {
     this.robot = skinned(this.geometry, new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.55, metalness: 0.15 }), count);
     this.robot.castShadow = true;
     this.robot.receiveShadow = true;
-    this.ghost = skinned(this.geometry, new THREE.MeshBasicMaterial({ color: 0xf97316, transparent: true, opacity: 0.16, depthWrite: false }), count);
-    this.ghost.visible = false;
+    this.ghost = skinned(this.geometry, new THREE.MeshBasicMaterial({ color: 0xf97316, transparent: true, opacity: 0.3 }), count);
+    const depth = new THREE.SkinnedMesh(this.geometry, new THREE.MeshBasicMaterial({ colorWrite: false })); // nearest faces only
+    depth.bind(this.ghost.skeleton, new THREE.Matrix4());
+    Object.assign(depth, { frustumCulled: false, renderOrder: 1 });
+    Object.assign(this.ghost, { visible: false, renderOrder: 2 });
+    this.ghost.add(depth);
     this.scene.add(this.robot, this.ghost);
   }
 
@@ -158,7 +164,7 @@ export class Scene {
       const shift = new THREE.Vector3(base.x - this.position.x, base.y - this.position.y, 0);
       this.camera.position.add(shift);
       this.orbit.target.add(shift);
-      const rise = 0.06 * (Math.max(0.35, 0.75 * base.z) - this.orbit.target.z);
+      const rise = (1 - Math.exp((this.lastFrame - now) / LAG)) * (Math.max(0.35, base.z - 0.2) - this.orbit.target.z);
       this.orbit.target.z += rise;
       this.camera.position.z += rise;
       this.position.copy(base);
@@ -177,15 +183,15 @@ export class Scene {
   adapt(now) {
     this.frames.push(now - this.lastFrame);
     this.lastFrame = now;
-    if (this.frames.length < 40) return;
-    const median = this.frames.sort((a, b) => a - b)[20];
+    if (this.frames.length < 12) return;
+    const median = this.frames.sort((a, b) => a - b)[6];
     this.frames = [];
     this.frameTime = median;
     if (median < SLOW) return;
-    if (this.ratio > 0.5) {
-      this.ratio = Math.max(0.5, 0.7 * this.ratio);
+    if (this.ratio > LEAST) {
+      this.ratio = Math.max(LEAST, this.ratio * Math.min(0.8, Math.sqrt(20 / median)));
       this.resize();
-    } else this.renderer.shadowMap.autoUpdate = this.sun.castShadow = false;
+    } else this.sun.castShadow = false;
   }
 }
 

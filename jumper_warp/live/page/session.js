@@ -5,14 +5,15 @@ const SQUAT = 30; // policy steps from the handover to the jump's command
 const [STANCE, FLIGHT, LANDED] = [0, 1, 2];
 const [TURNING, WALKING] = [2, 1.5]; // [1/s] gains of the approach: yaw rate over bearing, speed over distance
 const BEARING = 0.06; // [rad] largest bearing of a goal from which the robot jumps
+const BIAS = 1e-3; // [m/s] of the sideways velocity while it walks: an exactly symmetric robot does not alternate its legs
 const FALL_TIME = 2.5; // [s] from a fall to the reset
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 
-// Return the smallest and largest distance [m] of a jump from where the robot stands, within that of its training.
+// Return the smallest and largest distance [m] of a jump from where the robot stands; the training's range is larger.
 export function reach(policy) {
   const [low, high] = policy.range["distance ahead"];
-  const span = high - Math.max(low, 0);
-  return [Math.max(low, 0) + 0.1 * span, Math.max(low, 0) + 0.6 * span];
+  const nearest = Math.max(low, 0.15);
+  return [nearest, nearest + 0.7 * (high - nearest)];
 }
 
 export class Session {
@@ -60,7 +61,9 @@ export class Session {
     }
     if (this.skill === "walk") this.walk();
     const policy = this.policies[this.skill];
-    this.targets = policy.targets({ ...robot.readings(), ...this.commands() });
+    const readings = { ...robot.readings(), ...this.commands() };
+    if (this.skill === "walk") readings.lin_vel[1] += BIAS;
+    this.targets = policy.targets(readings);
     robot.step(this.targets, policy);
     if (this.skill !== "walk") this.advanceJump();
     if (!(robot.tilt < Math.PI / 3 && robot.height > 0.1)) {
@@ -93,7 +96,7 @@ export class Session {
     });
     if (this.request?.ready && this.command.every((x) => Math.abs(x) < 0.05) && this.atRest() && this.nearDefault()) {
       const { robot, request } = this;
-      this.jump = { ...request, phase: STANCE, steps: 0, phaseSteps: 0, apex: 0, ground: robot.ground, path: [] };
+      this.jump = { ...request, phase: STANCE, steps: 0, phaseSteps: 0, apex: 0, ground: robot.ground, start: robot.position, path: [] };
       this.handOver(request.skill);
       this.request = null;
     }
@@ -103,9 +106,7 @@ export class Session {
   approach(request) {
     if (request.goal && !request.ready) {
       const [x, y] = this.robot.offset(request.goal);
-      const [nearest, farthest] = reach(this.policies.jump_to);
-      const distance = Math.hypot(x, y);
-      const excess = distance - clamp(distance, nearest, farthest);
+      const excess = Math.max(0, Math.hypot(x, y) - reach(this.policies.jump_to)[1]);
       const bearing = Math.atan2(y, x);
       const toward = (gain, error, low, high) => Math.sign(error) * clamp(gain * Math.abs(error), low, high);
       if (Math.abs(bearing) > BEARING || excess !== 0) {
@@ -164,7 +165,8 @@ export class Session {
       this.handOver("walk");
       this.jump = null;
       const error = jump.goal ? Math.hypot(...robot.offset(jump.goal)) : jump.apex - jump.height;
-      this.finished({ height: jump.height, goal: jump.goal, apex: jump.apex, error, made: landed, path: jump.path });
+      const length = Math.hypot(robot.position[0] - jump.start[0], robot.position[1] - jump.start[1]);
+      this.finished({ height: jump.height, goal: jump.goal, apex: jump.apex, error, length, made: landed, path: jump.path });
     }
   }
 }
