@@ -1,4 +1,4 @@
-"""`jumper export`: save the policy of a training run as a folder, a policy as one ONNX file, or a page with policies."""
+"""`jumper export`: save a run's policy as a folder, a policy as one ONNX file, or a web page with policies."""
 
 from __future__ import annotations
 
