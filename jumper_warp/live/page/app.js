@@ -14,7 +14,7 @@ const meters = (x, digits = 2) => `${x.toFixed(digits)} m`;
 
 const scene = new Scene($("view"));
 const worker = new Worker("physics.js", { type: "module" });
-const page = { scene, state: null, jumps: [], times: null }; // also for tests
+const page = { scene, send, state: null, jumps: [], times: null, script: [] }; // also for tests and measurements
 window.page = page;
 let name = "plain";
 let dark = (localStorage.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
@@ -22,7 +22,9 @@ let info = null; // of the open scene
 let top = 0; // [m] largest height of the flight so far
 let notice = 0; // timer of a message
 
-const send = (type, content = {}) => { if (info || type === "open") worker.postMessage({ type, ...content }); };
+function send(type, content = {}) {
+  if (info) worker.postMessage({ type, ...content });
+}
 
 // Show a message for some time [ms], then the hint again; 0: until the next one.
 function say(text, time = 6000, kind = "") {
@@ -37,25 +39,26 @@ function distance([x, y]) {
   return Math.hypot(x - px, y - py);
 }
 
+const ready = () => info && page.state?.skill === "walk" && !page.state.fallen;
 const within = (place) => distance(place) >= info.reach[0] && distance(place) <= info.reach[1];
 
 const actions = {
   walk: (velocity) => send("walk", { velocity }),
   jumpUp: () => {
-    if (!info) return;
+    if (!ready()) return;
     const height = Number($("height").value);
     figure("…", `${meters(height)} asked`);
     send("jumpUp", { height });
   },
   jumpTo: (place) => {
-    if (!info || page.state.fallen) return;
+    if (!ready()) return;
     if (distance(place) < info.reach[0]) return say(`Too near: a jump ahead is at least ${meters(info.reach[0], 1)}.`, 3000);
     figure("…", `${meters(distance(place))} away`);
     if (!within(place)) say(`Too far for one jump of ${meters(info.reach[1], 1)}: it walks nearer first.`);
     send("jumpTo", { goal: place });
   },
   jumpAhead: () => {
-    if (!info) return;
+    if (!ready()) return;
     const { position: [x, y], yaw } = page.state;
     actions.jumpTo([x + AHEAD * Math.cos(yaw), y + AHEAD * Math.sin(yaw)]);
   },
@@ -65,7 +68,7 @@ const actions = {
     say(`Pushed with ${PUSH[0]} N for ${PUSH[1]} s. You can also drag the robot.`, 3000);
   },
   drag: (target) => send("drag", { target }),
-  hover: (place) => scene.mark("hover", info ? place : null, info && place && within(place)),
+  hover: (place) => scene.mark("hover", ready() ? place : null, place && ready() && within(place)),
   reset: () => {
     send("reset");
     scene.showJump(null);
@@ -139,7 +142,11 @@ function slider(id, text, send) {
   $(id).addEventListener("input", () => send?.(Number($(id).value)));
 }
 
-const set = (key) => (value) => send("set", { name: key, value });
+const set = (key) => (value) => {
+  send("set", { name: key, value });
+  const other = key === "gravity" && Math.abs(value - info?.gravity) > 1;
+  if (other) say("These policies were trained with the gravity of this scene: they may fall with another one.");
+};
 slider("height", (x) => meters(x));
 slider("friction", (x) => x.toFixed(2), set("friction"));
 slider("payload", (x) => `${x.toFixed(1)} kg`, set("payload"));
@@ -161,7 +168,7 @@ $("scene").onchange = () => {
 $("jump").onclick = actions.jumpUp;
 $("push").onclick = actions.push;
 $("reset").onclick = actions.reset;
-for (const button of document.querySelectorAll("button, input")) button.addEventListener("pointerup", () => button.blur());
+for (const button of document.querySelectorAll("button, input, summary")) button.addEventListener("pointerup", () => button.blur());
 $("theme").onclick = () => {
   dark = !dark;
   localStorage.theme = dark ? "dark" : "light";
@@ -207,6 +214,7 @@ addEventListener("resize", () => scene.resize());
 const controls = new Controls(scene, $("stick"), actions);
 
 function frame(now) {
+  const begin = performance.now();
   controls.poll();
   scene.draw(now);
   if (page.state && info) {
@@ -215,6 +223,7 @@ function frame(now) {
     const doing = skill === "walk" ? (waiting ? "gets ready" : speed < 0.05 ? "stands" : slip > SLIP ? "slips" : "walks") : phase === 1 ? "flies" : phase === 2 ? "lands" : "crouches";
     $("status").textContent = `${doing} · ${height.toFixed(2)} m high · ${speed.toFixed(1)} m/s`;
   }
+  page.script = [...page.script.slice(-99), performance.now() - begin]; // [ms] of the last frames
   requestAnimationFrame(frame);
 }
 

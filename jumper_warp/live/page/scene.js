@@ -1,7 +1,7 @@
 // The picture: robot, ground, goals, and the ghost of the last jump, drawn by three.js. World z is up.
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { mergeGeometries } from "three/examples/jsm/utils/BufferGeometryUtils.js";
+import { mergeGeometries, mergeVertices } from "three/examples/jsm/utils/BufferGeometryUtils.js";
 import { boxesOf, rough, surface } from "./ground.js";
 
 const [SPHERE, CYLINDER, BOX, MESH] = [2, 5, 6, 7]; // MuJoCo's types of geoms
@@ -20,9 +20,10 @@ const LEAST = 0.4; // pixels a CSS pixel of the lowest resolution
 export class Scene {
   constructor(canvas) {
     this.canvas = canvas;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
+    const slow = withoutGpu();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !slow });
     this.renderer.shadowMap.enabled = true;
-    this.ratio = Math.min(window.devicePixelRatio, 2);
+    this.ratio = slow ? 0.6 : Math.min(window.devicePixelRatio, 2);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.05, 80);
     this.camera.up.set(0, 0, 1);
@@ -33,7 +34,7 @@ export class Scene {
     this.ambient = new THREE.HemisphereLight(0xffffff, 0x8a8f94, 1.5);
     this.sun = new THREE.DirectionalLight(0xffffff, 2.4);
     this.sun.castShadow = true;
-    this.sun.shadow.mapSize.set(1024, 1024);
+    this.sun.shadow.mapSize.setScalar(slow ? 512 : 1024);
     this.sun.shadow.radius = 5;
     this.sun.shadow.normalBias = 0.02;
     Object.assign(this.sun.shadow.camera, { left: -2, right: 2, top: 2, bottom: -2, near: 0.5, far: 14 });
@@ -173,9 +174,7 @@ export class Scene {
       this.plane.position.set(Math.round(base.x), Math.round(base.y), 0);
     }
     this.orbit.update();
-    const begin = performance.now();
     this.renderer.render(this.scene, this.camera);
-    this.script = performance.now() - begin;
     this.adapt(now);
   }
 
@@ -193,6 +192,13 @@ export class Scene {
       this.resize();
     } else this.sun.castShadow = false;
   }
+}
+
+// Return whether the browser draws without a GPU.
+function withoutGpu() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  return !info || /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
 }
 
 function ring(inner, outer) {
@@ -242,9 +248,12 @@ function geometryOf({ type, size, color, body, pos, quat: [w, x, y, z], vertices
   } else if (type === CYLINDER) geometry = new THREE.CylinderGeometry(size[0], size[0], 2 * size[1], 28).rotateX(Math.PI / 2);
   else if (type === BOX) geometry = new THREE.BoxGeometry(...size.map((half) => 2 * half));
   else if (type === SPHERE) geometry = new THREE.SphereGeometry(size[0], 20, 14);
-  geometry = geometry.index ? geometry.toNonIndexed() : geometry;
   geometry.deleteAttribute("uv");
-  if (type === MESH) geometry.computeVertexNormals();
+  if (type === MESH) { // flat faces
+    geometry = geometry.toNonIndexed();
+    geometry.computeVertexNormals();
+    geometry = mergeVertices(geometry);
+  }
   geometry.applyQuaternion(new THREE.Quaternion(x, y, z, w)).translate(...pos);
   const count = geometry.attributes.position.count;
   const rgb = new THREE.Color().setRGB(...color.slice(0, 3), THREE.SRGBColorSpace);
