@@ -3,10 +3,9 @@ import { Controls } from "./controls.js";
 import { Scene } from "./scene.js";
 
 const PUSH = [70, 0.2]; // [N], [s] of the push key
-const AHEAD = 0.9; // [m] of the gamepad's jump ahead
 const SLIP = 0.15; // [m/s] mean speed of the fastest paw on the ground from which a walk slips
 const HINT = matchMedia("(pointer: coarse)").matches
-  ? "Tap the ground: the robot jumps there."
+  ? "Tap the ground: the robot jumps there. The stick walks."
   : "Click the ground: the robot jumps there. <kbd>W</kbd><kbd>A</kbd><kbd>S</kbd><kbd>D</kbd> walk, <kbd>space</kbd> jumps up.";
 const PLANETS = { Earth: 9.81, Mars: 3.71, Moon: 1.62 };
 const $ = (id) => document.getElementById(id);
@@ -40,27 +39,23 @@ function distance([x, y]) {
 }
 
 const ready = () => info && page.state?.skill === "walk" && !page.state.fallen;
+const wait = () => info && say("Wait until it stands.", 1500);
 const within = (place) => distance(place) >= info.reach[0] && distance(place) <= info.reach[1];
 
 const actions = {
   walk: (velocity) => send("walk", { velocity }),
   jumpUp: () => {
-    if (!ready()) return;
+    if (!ready()) return wait();
     const height = Number($("height").value);
     figure("…", `${meters(height)} asked`);
     send("jumpUp", { height });
   },
   jumpTo: (place) => {
-    if (!ready()) return;
+    if (!ready()) return wait();
     if (distance(place) < info.reach[0]) return say(`Too near: a jump ahead is at least ${meters(info.reach[0], 1)}.`, 3000);
     figure("…", `${meters(distance(place))} away`);
     if (!within(place)) say(`Too far for one jump of ${meters(info.reach[1], 1)}: it walks nearer first.`);
     send("jumpTo", { goal: place });
-  },
-  jumpAhead: () => {
-    if (!ready()) return;
-    const { position: [x, y], yaw } = page.state;
-    actions.jumpTo([x + AHEAD * Math.cos(yaw), y + AHEAD * Math.sin(yaw)]);
   },
   push: () => {
     const angle = 2 * Math.PI * Math.random();
@@ -92,7 +87,7 @@ const receive = {
     $("height").oninput();
     setSlider("gravity", data.gravity);
     setSlider("friction", data.friction);
-    $("names").textContent = Object.values(data.policies).join(", ");
+    $("names").textContent = data.policies.join(", ");
     $("loading").hidden = true;
     page.opened = data.scene;
     say(HINT, 0);
@@ -110,13 +105,13 @@ const receive = {
     page.jumps.push(jump);
     scene.showJump(jump);
     if (!jump.made) figure("no jump", "It stayed on the ground.");
-    else if (jump.goal) figure(`${(100 * jump.error).toFixed(1)} cm off`, `${meters(jump.length)} far, ${meters(jump.apex)} high`);
-    else figure(meters(jump.apex, 3), `${meters(jump.height)} asked, ${meters(jump.apex, 3)} reached`);
+    else if (jump.height) figure(meters(jump.apex, 3), `${meters(jump.height)} asked, ${meters(jump.apex, 3)} reached`);
+    else figure(`${(100 * jump.error).toFixed(1)} cm off`, `${meters(jump.length)} far, ${meters(jump.apex)} high`);
   },
   times: (times) => { page.times = times; },
   error: ({ text }) => {
     $("loading").hidden = true;
-    say(text, 10000, "bad");
+    say(text.replaceAll("<", "&lt;"), 10000, "bad");
   },
 };
 
@@ -168,7 +163,7 @@ $("scene").onchange = () => {
 $("jump").onclick = actions.jumpUp;
 $("push").onclick = actions.push;
 $("reset").onclick = actions.reset;
-for (const button of document.querySelectorAll("button, input, summary")) button.addEventListener("pointerup", () => button.blur());
+for (const each of document.querySelectorAll("button, input, summary")) each.addEventListener("pointerup", () => each.blur());
 $("theme").onclick = () => {
   dark = !dark;
   localStorage.theme = dark ? "dark" : "light";
@@ -213,15 +208,22 @@ $("files").onchange = () => take([...$("files").files]);
 addEventListener("resize", () => scene.resize());
 const controls = new Controls(scene, $("stick"), actions);
 
+const speed = ([x, y]) => Math.hypot(x, y);
+
+// Return what the robot does, in a word or two.
+function doing({ skill, phase, waiting, velocity, slip }) {
+  if (skill !== "walk") return ["crouches", "flies", "lands"][phase];
+  if (waiting) return "gets ready";
+  return speed(velocity) < 0.05 ? "stands" : slip > SLIP ? "slips" : "walks";
+}
+
 function frame(now) {
   const begin = performance.now();
   controls.poll();
   scene.draw(now);
   if (page.state && info) {
-    const { velocity, height, skill, phase, waiting, slip } = page.state;
-    const speed = Math.hypot(velocity[0], velocity[1]);
-    const doing = skill === "walk" ? (waiting ? "gets ready" : speed < 0.05 ? "stands" : slip > SLIP ? "slips" : "walks") : phase === 1 ? "flies" : phase === 2 ? "lands" : "crouches";
-    $("status").textContent = `${doing} · ${height.toFixed(2)} m high · ${speed.toFixed(1)} m/s`;
+    const { velocity, height } = page.state;
+    $("status").textContent = `${doing(page.state)} · ${height.toFixed(2)} m high · ${speed(velocity).toFixed(1)} m/s`;
   }
   page.script = [...page.script.slice(-99), performance.now() - begin]; // [ms] of the last frames
   requestAnimationFrame(frame);

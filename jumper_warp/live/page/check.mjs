@@ -4,7 +4,7 @@ import fs from "node:fs";
 import zlib from "node:zlib";
 import loadMujoco from "@mujoco/mujoco";
 import { readPolicy } from "./policy.js";
-import { Robot } from "./robot.js";
+import { MESHES, Robot } from "./robot.js";
 import { Session } from "./session.js";
 
 async function policyOf(folder) {
@@ -82,8 +82,7 @@ async function jumps(site, name, list, scene = "plain") {
 
 function robotFiles() {
   const folder = new URL("../../../assets/jumper/", import.meta.url);
-  const meshes = ["shank", "shell", "spine", "thigh"];
-  const files = meshes.map((name) => [name, new Uint8Array(fs.readFileSync(new URL(`meshes/${name}.obj`, folder)))]);
+  const files = MESHES.map((name) => [name, new Uint8Array(fs.readFileSync(new URL(`meshes/${name}.obj`, folder)))]);
   return { xml: fs.readFileSync(new URL("jumper.xml", folder), "utf8"), ...Object.fromEntries(files) };
 }
 

@@ -45,7 +45,7 @@ export class Controls {
     if (pad) {
       const axis = (i) => (Math.abs(pad.axes[i] ?? 0) > DEAD ? -pad.axes[i] : 0);
       [axis(1), axis(0), axis(2)].forEach((x, i) => { sum[i] += x; });
-      ["jumpUp", "push", "jumpAhead", "reset"].forEach((action, i) => {
+      ["jumpUp", "push", "reset"].forEach((action, i) => {
         const pressed = Boolean(pad.buttons[i]?.pressed);
         if (pressed && !this.padPressed[i]) this.actions[action]();
         this.padPressed[i] = pressed;

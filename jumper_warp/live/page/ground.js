@@ -21,7 +21,8 @@ export function rough() {
   let seed = 7;
   const random = () => { seed = (seed * 16807) % 2147483647; return seed / 2147483647; };
   const waves = Array.from({ length: 24 }, () => {
-    const [angle, length] = [2 * Math.PI * random(), 0.35 + 1.2 * random()];
+    const angle = 2 * Math.PI * random();
+    const length = 0.35 + 1.2 * random();
     return [(2 * Math.PI * Math.cos(angle)) / length, (2 * Math.PI * Math.sin(angle)) / length, 2 * Math.PI * random()];
   });
   const data = new Float32Array(CELLS * CELLS);

@@ -1,7 +1,7 @@
 // Worker: MuJoCo and the policies in real time. Receives requests of the page, and posts the state after each step.
 import loadMujoco from "@mujoco/mujoco";
 import { readPolicy } from "./policy.js";
-import { Robot } from "./robot.js";
+import { MESHES, Robot } from "./robot.js";
 import { DT, Session, reach } from "./session.js";
 
 const LATE = 100; // [ms] delay after which the clock restarts, instead of catching up
@@ -27,8 +27,8 @@ async function get(path, kind) {
 }
 
 async function policy(name) {
-  policies[name] ??= await Promise.all([get(`policies/${name}/policy.json`, "json"), get(`policies/${name}/policy.bin`, "arrayBuffer")])
-    .then(([description, bytes]) => readPolicy(description, bytes));
+  const folder = `policies/${name}/policy`;
+  policies[name] ??= readPolicy(...await Promise.all([get(`${folder}.json`, "json"), get(`${folder}.bin`, "arrayBuffer")]));
   return policies[name];
 }
 
@@ -37,8 +37,7 @@ async function open(scene) {
   const names = Object.entries((scenes ??= await get("scenes.json", "json"))[scene]);
   const loading = Promise.all(names.map(async ([skill, name]) => [skill, own[skill] ?? await policy(name)]));
   if (!mujoco) {
-    const meshes = ["shank", "shell", "spine", "thigh"];
-    const bytes = meshes.map(async (name) => [name, new Uint8Array(await get(`meshes/${name}.obj`, "arrayBuffer"))]);
+    const bytes = MESHES.map(async (name) => [name, new Uint8Array(await get(`meshes/${name}.obj`, "arrayBuffer"))]);
     [mujoco, files] = await Promise.all([
       loadMujoco({ locateFile: (name) => url(name).href }),
       Promise.all([get("jumper.xml", "text"), ...bytes]).then(([xml, ...rest]) => ({ xml, ...Object.fromEntries(rest) })),
@@ -52,9 +51,8 @@ async function open(scene) {
   values.friction ??= loaded.walk.friction;
   apply();
   post("scene", {
-    scene, shapes: robot.shapes(), gravity: values.gravity, friction: values.friction,
-    heights: Object.values(loaded.jump_up.range)[0], policies: Object.fromEntries(Object.entries(loaded).map(([k, p]) => [k, p.name])),
-    reach: reach(loaded.jump_to), speeds: Object.values(loaded.walk.range),
+    scene, shapes: robot.shapes(), gravity: values.gravity, friction: values.friction, reach: reach(loaded.jump_to),
+    heights: Object.values(loaded.jump_up.range)[0], policies: Object.values(loaded).map((each) => each.name),
   });
 }
 
@@ -71,8 +69,8 @@ function report({ path, ...outcome }) {
 function step() {
   const begin = performance.now();
   if (session.drag && !session.fallen) {
-    const [v, p] = [robot.velocity, robot.position];
-    const force = session.drag.map((target, i) => PULL[0] * (target - p[i]) - PULL[1] * v[i]);
+    const { position, velocity } = robot;
+    const force = session.drag.map((target, i) => PULL[0] * (target - position[i]) - PULL[1] * velocity[i]);
     const size = Math.hypot(...force);
     session.push(force.map((x) => x * Math.min(1, PULL[2] / size)), 2 * DT);
   }

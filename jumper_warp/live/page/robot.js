@@ -2,9 +2,8 @@
 import { boxesOf, rough, surface } from "./ground.js";
 
 export const LEGS = ["FL", "FR", "BL", "BR"];
-const MESHES = ["shank", "shell", "spine", "thigh"];
+export const MESHES = ["shank", "shell", "spine", "thigh"];
 const SUBSTEPS = 8; // physics steps of a policy step
-const HEAVY = 1e10; // [N] no limit of an actuator
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 
 // Return a vector in the axes of a body with quaternion q.
@@ -34,13 +33,11 @@ export class Robot {
     for (let i = 0; i < 12; i++) { // torques of motors are computed here; the model's actuators damp the knees only
       model.actuator_gainprm[10 * i] = 0;
       model.actuator_biasprm.fill(0, 10 * i, 10 * i + 10);
-      model.actuator_forcerange.set([-HEAVY, HEAVY], 2 * i);
     }
     this.folds = model.tendon_range.slice(0, 2);
     for (let i = 0; i < 4; i++) model.tendon_range.set([-9, 9], 2 * i); // these stops are computed here, as on SolverMuJoCo
     this.nominal = { mass: model.body_mass[this.base], inertia: model.body_inertia.slice(3 * this.base, 3 * this.base + 3) };
     this.push = [0, 0, 0, 0, 0, 0]; // force [N] and torque [N m] on the base, world axes
-    this.torque = new Float64Array(12);
     this.reset();
   }
 
@@ -82,13 +79,13 @@ export class Robot {
 
   // Advance a policy step towards motor targets [rad], (12,); without a policy the motors damp.
   step(targets, policy) {
-    const { data, model, mujoco, torque } = this;
+    const { data, model, mujoco } = this;
     data.xfrc_applied.set(this.push, 6 * this.base);
     for (let substep = 0; substep < SUBSTEPS; substep++) {
       const { qpos, qvel, qfrc_applied: applied } = data;
       for (let i = 0; i < 12; i++) {
-        torque[i] = policy ? motorTorque(policy, i, targets[i], qpos[this.q[i]], qvel[this.v[i]]) : -2 * qvel[this.v[i]];
-        applied[this.v[i]] = torque[i];
+        const rate = qvel[this.v[i]];
+        applied[this.v[i]] = policy ? motorTorque(policy, i, targets[i], qpos[this.q[i]], rate) : -2 * rate;
       }
       for (let i = 1; i < 12; i += 3) {
         const [a, b] = [this.v[i], this.v[i + 1]];
@@ -110,8 +107,7 @@ export class Robot {
   get position() { return this.data.qpos.slice(0, 3); }
   get velocity() { return this.data.qvel.slice(0, 3); }
   get quat() { return this.data.qpos.slice(3, 7); }
-  get up() { return toBody(this.quat, [0, 0, 1]); }
-  get tilt() { return Math.acos(clamp(this.up[2], -1, 1)); }
+  get tilt() { return Math.acos(clamp(toBody(this.quat, [0, 0, 1])[2], -1, 1)); }
   get contacts() { return this.contactTime.filter((time) => time > 0).length; }
   get ground() { return surface(this.scene, this.data.qpos[0], this.data.qpos[1]); }
   get height() { return this.data.qpos[2] - this.ground; }
@@ -145,7 +141,8 @@ export class Robot {
 
   // Return the distances [m] at which three rays ahead enter and leave the next block, and its height [m].
   blockAhead() {
-    const [x, y, floor] = [...this.position.slice(0, 2), this.ground];
+    const [x, y] = this.position;
+    const floor = this.ground;
     const heading = [Math.cos(this.yaw), Math.sin(this.yaw)];
     const rays = [0.2, 0, -0.2].map((side) => [x - side * heading[1], y + side * heading[0]]);
     const edges = (box, from) => {

@@ -52,16 +52,16 @@ export class Scene {
     this.resize();
   }
 
-  // Draw another robot; shapes: see `Robot.shapes`.
+  // Draw a robot, the same in all scenes; shapes: see `Robot.shapes`.
   setRobot(shapes) {
-    this.geometry ??= mergeGeometries(shapes.map(geometryOf));
     if (this.robot) return;
+    const geometry = mergeGeometries(shapes.map(geometryOf));
     const count = Math.max(...shapes.map((shape) => shape.body)) + 1;
-    this.robot = skinned(this.geometry, new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.55, metalness: 0.15 }), count);
+    this.robot = skinned(geometry, new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.55, metalness: 0.15 }), count);
     this.robot.castShadow = true;
     this.robot.receiveShadow = true;
-    this.ghost = skinned(this.geometry, new THREE.MeshBasicMaterial({ color: 0xf97316, transparent: true, opacity: 0.3 }), count);
-    const depth = new THREE.SkinnedMesh(this.geometry, new THREE.MeshBasicMaterial({ colorWrite: false })); // nearest faces only
+    this.ghost = skinned(geometry, new THREE.MeshBasicMaterial({ color: 0xf97316, transparent: true, opacity: 0.3 }), count);
+    const depth = new THREE.SkinnedMesh(geometry, new THREE.MeshBasicMaterial({ colorWrite: false })); // nearest faces only
     depth.bind(this.ghost.skeleton, new THREE.Matrix4());
     Object.assign(depth, { frustumCulled: false, renderOrder: 1 });
     Object.assign(this.ghost, { visible: false, renderOrder: 2 });

@@ -22,6 +22,7 @@ export class Session {
     this.robot = robot;
     this.policies = policies;
     this.finished = finished;
+    this.drag = null; // place [m] to which the visitor pulls the robot
     this.velocity = [0, 0, 0]; // commanded by the visitor: ahead, left [m/s], about z [rad/s]
     this.reset();
   }
@@ -96,7 +97,8 @@ export class Session {
     });
     if (this.request?.ready && this.command.every((x) => Math.abs(x) < 0.05) && this.atRest() && this.nearDefault()) {
       const { robot, request } = this;
-      this.jump = { ...request, phase: STANCE, steps: 0, phaseSteps: 0, apex: 0, ground: robot.ground, start: robot.position, path: [] };
+      const { ground, position: start } = robot;
+      this.jump = { ...request, phase: STANCE, steps: 0, phaseSteps: 0, apex: 0, ground, start, path: [] };
       this.handOver(request.skill);
       this.request = null;
     }
