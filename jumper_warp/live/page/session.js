@@ -118,8 +118,9 @@ export class Session {
     }
     request.ready = true;
     request.waited += DT;
-    const nudged = request.waited > 2 && request.waited % 2 < 0.5; // steps of a robot that does not come to rest
-    return nudged ? [0.25, 0, 0] : [0, 0, 0];
+    const restless = request.waited > 2 && request.waited % 2 < 0.5;
+    const crooked = !this.nearDefault() && request.waited % 1 > 0.4;
+    return restless || crooked ? [0.25, 0, 0] : [0, 0, 0]; // steps of a robot that does not stand as before a jump
   }
 
   atRest() {
