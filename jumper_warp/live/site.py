@@ -28,7 +28,7 @@ TERMS = frozenset({
     "command", "wanted_height", "jump_command", "goal", "height", "lin_vel", "ang_vel", "gravity", "angle", "rate",
     "last_action", "block_ahead", "way",
 })  # fmt: skip
-"""Observation terms that the page computes; `READINGS` in page/policy.js has the same names."""
+"""Observation terms that the page computes; `TERMS` in page/policy.js has the same names."""
 EARTH = {"walk": "walking_flat", "jump_up": "vertical_jump", "jump_to": "horizontal_jump"}
 SCENES = {
     "plain": EARTH,

@@ -146,14 +146,27 @@ def test_walk_slips_at_low_friction(visitor):
     visitor.locator("summary").click()
 
 
+DROP = """async (folder) => {
+    const data = new DataTransfer();
+    for (const name of ["policy.json", "policy.bin"]) {
+        const answer = await fetch(`${folder}/${name}`);
+        data.items.add(new File([await answer.arrayBuffer()], name));
+    }
+    dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+}"""
+"""Function of the page that drops the two files of a policy onto it."""
+
+
 def test_dropped_policy_runs_and_a_damaged_one_is_one_line(visitor, tmp_path):
+    visitor.evaluate(DROP, "policies/walking_rough")
+    visitor.wait_for_function("document.getElementById('names').textContent.includes('walking_rough')")
+    visitor.wait_for_function("page.state && !page.state.fallen")
     policy = tmp_path / "mine"
     policy.mkdir()
-    for file, content in browser_files(Policy.load("walking_rough"), "mine").items():
+    for file, content in browser_files(Policy.load("walking_flat"), "mine").items():
         (policy / file).write_bytes(content)
     visitor.locator("#files").set_input_files(policy)
     visitor.wait_for_function("document.getElementById('names').textContent.includes('mine')")
-    visitor.wait_for_function("page.state && !page.state.fallen")
     data = bytearray((policy / "policy.bin").read_bytes())
     data[1000] ^= 64
     (policy / "policy.bin").write_bytes(data)

@@ -99,7 +99,7 @@ const receive = {
     if (top) figure(meters(top), $("small").textContent);
     page.state = state;
     scene.update(state.poses, 1000 / 60 / state.speed);
-    scene.mark("goal", state.goal, state.goal && within(state.goal));
+    scene.mark("goal", state.goal, state.goal && distance(state.goal) <= info.reach[1]);
   },
   jump: (jump) => {
     page.jumps.push(jump);
@@ -160,9 +160,7 @@ $("scene").onchange = () => {
   open($("scene").value);
   $("scene").blur();
 };
-$("jump").onclick = actions.jumpUp;
-$("push").onclick = actions.push;
-$("reset").onclick = actions.reset;
+for (const id of ["jumpUp", "push", "reset"]) $(id).onclick = actions[id];
 for (const each of document.querySelectorAll("button, input, summary")) each.addEventListener("pointerup", () => each.blur());
 $("theme").onclick = () => {
   dark = !dark;
@@ -192,11 +190,12 @@ async function take(files) {
 // Return the files of dropped files and folders.
 async function filesOf(items) {
   const read = async (entry) => {
+    if (entry instanceof File) return [entry];
     if (entry.isFile) return [await new Promise((resolve, reject) => { entry.file(resolve, reject); })];
     const entries = await new Promise((resolve, reject) => { entry.createReader().readEntries(resolve, reject); });
     return (await Promise.all(entries.map(read))).flat();
   };
-  return (await Promise.all(items.map((item) => item.webkitGetAsEntry()).filter(Boolean).map(read))).flat();
+  return (await Promise.all(items.map((item) => item.webkitGetAsEntry() ?? item.getAsFile()).map(read))).flat();
 }
 
 addEventListener("dragover", (event) => event.preventDefault());

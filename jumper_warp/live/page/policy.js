@@ -1,5 +1,5 @@
 // A policy: observation with history, network, and motor command filter, as in training.
-// `policy.json` and `policy.bin` are written by `jumper export`; see docs/reference/browser_policy.md.
+// `policy.json` and `policy.bin` are written by `jumper export`; see docs/reference/formats.md.
 
 export const FORMAT = "jumper-warp policy for browsers 1";
 const COMMAND_BOUND = 4 * Math.PI; // [rad] motor targets are clipped to ± this before the filter
