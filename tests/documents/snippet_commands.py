@@ -24,8 +24,8 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.errors import InputError
 
 ROOT = Path(__file__).parents[2]
-OUTPUTS = ("out", "video", "log_root", "write_tables", "readme")  # fields whose paths need not exist
-POLICIES = ("policy", "policies", "landing_policy", "init_policy", "source", "walk", "jump_up", "jump_to")
+OUTPUTS = ("out", "page", "video", "log_root", "write_tables", "readme")  # fields whose paths need not exist
+POLICIES = ("policy", "policies", "landing_policy", "init_policy", "source", "sources", "walk", "jump_up", "jump_to")
 OPENED = ("evaluate", "play", "finetune", "export", "info")  # commands whose first argument is a policy
 VIEWERS = ("rerun", "tensorboard", "xdg-open")  # never run
 OPERATORS = "();<>|&"

