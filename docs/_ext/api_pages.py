@@ -52,9 +52,8 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "identification.residuals", "identification.least_squares", "identification.initial_states",
         "identification.uncertainty", "identification.results", "identification.report", "identification.replay",
     )),
-    "trajectory": ("Trajectory optimization", (
-        "trajectory.problem", "trajectory.jumps", "trajectory.gauss_newton", "trajectory.augmented_lagrangian",
-        "trajectory.smoothing", "trajectory.whole_body",
+    "trajectory": ("Plans and fine-tuning", (
+        "trajectory.plan", "trajectory.gauss_newton", "evaluation.predictive_control",
     )),
     "viz": ("Recordings and pictures", (
         "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.rerun_server",
