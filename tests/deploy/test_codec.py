@@ -22,7 +22,9 @@ def test_commands_are_bit_equal_to_cantools(database):
     commands[2] = np.minimum(commands[2], 499.8)  # kp stays one step below its full scale
     messages = [database.get_message_by_frame_id(i + 1) for i in range(3)]
     names = ("position", "velocity", "kp", "kd", "torque")
-    expected = [messages[i % 3].encode(dict(zip(names, values))) for i, values in enumerate(commands.T.tolist())]
+    expected = [
+        messages[i % 3].encode(dict(zip(names, values, strict=True))) for i, values in enumerate(commands.T.tolist())
+    ]
     assert codec.encode(commands).tobytes() == b"".join(expected)
 
 

@@ -1,0 +1,147 @@
+"""Export of a bundle: deploy.yaml, the policies' ONNX files, their conformance vectors and the runtime as deploy.pyz."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from jumper_warp.deploy.bundle import FILE, VERSION, settings_hash
+from jumper_warp.policies.policy import Policy, bundle_onnx
+from jumper_warp.policies.spec import PolicyInterface
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+
+SKILL_OF_COMMAND = {"wanted_height": "jump_up", "goal": "jump_to", "command": "walk"}
+"""Skill of a policy by the observation term that holds its command."""
+COMMAND_RANGES = {
+    "walk": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-1.0, 1.0]},
+    "jump_up": {"wanted_height": [0.5, 1.0]},
+    "jump_to": {"ahead": [-0.5, 1.5], "left": [-0.5, 0.5]},
+}
+"""Ranges of commands by skill, [m/s], [rad/s], [m]; the runtime clips requests to them."""
+WALKING_LIMITS = {"lateral": (-50.0, 110.0), "transversal": (-30.0, 140.0)}  # [deg] hard stops of the joints
+
+
+def skill_of(interface: PolicyInterface) -> str:
+    """Return the skill of a policy: walk, jump_up or jump_to. Raises InputError: the runtime has none for it."""
+    for term, skill in SKILL_OF_COMMAND.items():
+        if term in interface.observation_layout:
+            return skill
+    raise InputError(f"{interface.task}: a bundle takes policies that walk, jump up or jump to a place")
+
+
+def policy_settings(interface: PolicyInterface, file: str) -> dict[str, Any]:
+    """Return a policy's section of deploy.yaml, with the keys of unitree's files."""
+    skill = skill_of(interface)
+    return {
+        "file": file,
+        "task": interface.task,
+        "skill": skill,
+        "step_dt": interface.policy_dt,
+        "stiffness": list(interface.joint_stiffness),
+        "damping": list(interface.joint_damping),
+        "torque_limit": list(interface.torque_limit),
+        "default_joint_pos": list(interface.default_joint_pos),
+        "actions": {
+            "JointPositionAction": {
+                "clip": [-1.0, 1.0],
+                "joint_names": list(interface.joint_names),
+                "scale": list(interface.action_scale),
+                "offset": list(interface.default_joint_pos),
+                "joint_ids": None,
+            }
+        },
+        "observations": {
+            name: {"params": {}, "clip": [-term["clip"], term["clip"]], "scale": term["scale"],
+                   "history_length": term["history"]}
+            for name, term in interface.observation_layout.items()
+        },
+        "commands": COMMAND_RANGES[skill],
+        "command_filter": interface.command_filter,
+    }  # fmt: skip
+
+
+def robot_settings() -> dict[str, Any]:
+    """Return the sections of deploy.yaml that all policies share."""
+    description = load_description()
+    motors = description.motors
+    joints = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]
+    kinds = ["lateral" if name.endswith("lateral") else "transversal" for name in joints]
+    default = [float(angle) for angle in description.pose("default")]
+    folded = [0.0 if kind == "lateral" else math.radians(100.0) for kind in kinds]
+    return {
+        "version": VERSION,
+        "step_dt": 1.0 / 60.0,
+        "rate": 480,
+        "joint_names": joints,
+        "joint_ids_map": list(range(12)),
+        "joint_signs": [1] * 12,
+        "joint_offsets": [0.0] * 12,
+        "motors": [motor.type for motor in motors],
+        "can": {"reply_id": 0},
+        "default_joint_pos": default,
+        "hold": {
+            "stiffness": [motor.jumping.kp for motor in motors],
+            "damping": [motor.jumping.kd for motor in motors],
+            "torque_limit": [10.0 if kind == "lateral" else 18.0 for kind in kinds],
+        },
+        "stand_up": {"folded": folded, "seconds": 2.0},
+        "torque_curve": {
+            "peak": [motor.peak_torque for motor in motors],
+            "cutoff_speed": [motor.cutoff_speed for motor in motors],
+            "no_load_speed": [motor.no_load_speed for motor in motors],
+            "fade_start": [OVERSPEED_START] * 12,
+            "fade_end": [OVERSPEED_END] * 12,
+        },
+        "closed_chain": {"transversal_sum": [math.degrees(limit) for limit in description.transversal_sum]},
+        "safety": {
+            "lower": [WALKING_LIMITS[kind][0] for kind in kinds],
+            "upper": [WALKING_LIMITS[kind][1] for kind in kinds],
+            "position_margin": 12.0,
+            "max_rate": 45.0,
+            "max_temperature": 80.0,
+            "max_tilt": 60.0,
+            "torque_factor": 1.2,
+            "torque_margin": 2.0,
+            "max_late": 1.0e-3,
+            "damping": [2.0] * 12,
+        },
+        "switch": {"rest_speed": 0.10, "rest_spin": 0.30, "rest_tilt": 0.14, "max_offset": 0.44},
+        "estimator": {},
+    }
+
+
+def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
+    """Write a bundle of named policies to a folder, and return it.
+
+    Raises InputError: two policies have the same skill, or one has none.
+    """
+    settings = robot_settings()
+    files: dict[str, bytes] = {}
+    sections: dict[str, Any] = {}
+    for name, policy in policies:
+        section = policy_settings(policy.interface, f"{name}.onnx")
+        if section["skill"] in {each["skill"] for each in sections.values()}:
+            raise InputError(f"{name}: the bundle already has a policy for {section['skill']}")
+        sections[name] = section
+        files[f"{name}.onnx"] = bundle_onnx(policy, SKILL_OF_COMMAND)
+    settings["policies"] = sections
+    return write_bundle(settings, files, folder)
+
+
+def write_bundle(settings: dict[str, Any], files: dict[str, bytes], folder: Path) -> Path:
+    """Write files by name, and deploy.yaml with their hashes; return the folder."""
+    settings = settings | {"files": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
+    settings["sha256"] = settings_hash(settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        write_atomically(folder / name, data)
+    write_atomically(folder / FILE, yaml.safe_dump(settings, sort_keys=False).encode())
+    return folder

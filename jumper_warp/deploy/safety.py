@@ -1,0 +1,91 @@
+"""Faults of the machine: how each is detected, and after how many ticks the robot leaves its policy.
+
+A fault of ACTING ends the policy in its first tick. With any other one the motors keep their last target for up to
+HOLD_TICKS ticks; in the next tick the policy ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
+
+
+class Fault(IntEnum):
+    """Faults that end a policy."""
+
+    NONE = 0
+    SILENT = 1  # a motor does not reply
+    BUS_OFF = 2  # a bus cannot send
+    ERROR_FRAME = 3  # error frames on a bus
+    WRONG_ID = 4  # a frame of another id scheme
+    MOTOR_ERROR = 5  # a motor reports an error
+    TEMPERATURE = 6
+    TORQUE = 7  # a motor exceeds its torque limit
+    SPEED = 8
+    POSITION = 9
+    TILT = 10
+    STALE = 11  # the IMU sends nothing new
+    DIVERGED = 12  # the state source has no estimate
+    NOT_FINITE = 13  # the policy's action or observation is not finite
+    LATE = 14
+    STOP = 15  # the operator's stop
+    SIGN = 16  # a leg does not move the base as it should
+
+
+ACTING = {
+    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.SPEED, Fault.POSITION, Fault.TILT, Fault.STOP,
+    Fault.SIGN,
+}  # fmt: skip
+"""Faults that end the policy at once."""
+
+
+class Safety:
+    """Checks of every tick."""
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        """Read the section safety of deploy.yaml."""
+        self._limits = settings
+        lower, upper = np.radians(settings["lower"]), np.radians(settings["upper"])
+        margin = np.radians(settings["position_margin"])
+        self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
+        self.fault = Fault.NONE
+        self.ticks = 0  # for how long it has lasted
+
+    def check(
+        self, received: np.ndarray, q: np.ndarray, qd: np.ndarray, torque: np.ndarray, limit: np.ndarray,
+        temperature: np.ndarray, error: np.ndarray, *, tilt: float, stale: bool, diverged: bool, finite: bool,
+        late: float, stop: bool,
+    ) -> bool:  # fmt: skip
+        """Update `fault` and `ticks`, and return whether the policy must end.
+
+        received: record of the tick's frames. q, qd, torque, limit: (12,) [rad], [rad/s], [N m]. temperature [°C],
+        error: (12,). tilt: angle from upright [rad], 0 in flight. late: delay of the tick [s].
+        """
+        limits = self._limits
+        found = (
+            (Fault.STOP, stop),
+            (Fault.WRONG_ID, received["unknown"] > 0),
+            (Fault.MOTOR_ERROR, (error != 0).any()),
+            (Fault.TEMPERATURE, (temperature > limits["max_temperature"]).any()),
+            (Fault.SPEED, (np.abs(qd) > limits["max_rate"]).any()),
+            (Fault.POSITION, ((q < self._lower) | (q > self._upper)).any()),
+            (Fault.TILT, tilt > np.radians(limits["max_tilt"])),
+            (Fault.BUS_OFF, received["bus_off"].any()),
+            (Fault.ERROR_FRAME, received["error_frames"] > 0),
+            (Fault.SILENT, not received["motor_fresh"].all()),
+            (Fault.TORQUE, (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()),
+            (Fault.STALE, stale),
+            (Fault.DIVERGED, diverged),
+            (Fault.NOT_FINITE, not finite),
+            (Fault.LATE, late > limits["max_late"]),
+        )
+        fault = next((fault for fault, present in found if present), Fault.NONE)
+        self.ticks = self.ticks + 1 if fault else 0
+        self.fault = fault
+        gone = late > (HOLD_TICKS + 1) * limits["max_late"] * 2.0
+        return fault in ACTING or self.ticks > HOLD_TICKS or gone
