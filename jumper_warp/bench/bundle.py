@@ -1,4 +1,4 @@
-"""Export of a bundle: deploy.yaml, the policies' ONNX files, their conformance vectors and the runtime as deploy.pyz."""
+"""Export of a bundle: deploy.yaml, ONNX files of policies, their conformance vectors and the runtime as deploy.pyz."""
 
 from __future__ import annotations
 

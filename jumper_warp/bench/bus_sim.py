@@ -24,11 +24,11 @@ from jumper_warp.deploy.sensors import (
     pack_imu,
     pack_vector,
 )
+from jumper_warp.deploy.skills import rotate
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
-from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 CONTACT_FORCE = 0.1  # [N] of a paw that is down
 
@@ -61,7 +61,7 @@ class BusSim:
         )
         self.codec = Codec([motor.type for motor in load_description().motors])
         self.rng = np.random.default_rng(self.faults.seed)
-        self.command = np.zeros((5, 12))
+        self.command = np.zeros((12, 8), np.uint8)  # newest command frame of each motor
         self.enabled = np.zeros(12, bool)
         self.zero = np.zeros(12)  # [rad] position of each motor at its zero
         self.silent: set[int] = set()  # motors that do not reply
@@ -123,13 +123,11 @@ class BusSim:
         """Store a motor's command, or switch it."""
         if data in (ENTER, EXIT):
             self.enabled[motor] = data == ENTER
-            self.command[:, motor] = 0.0
+            self.command[motor] = 0
         elif data == ZERO:
             self.zero[motor] = self.angle[motor]
         else:
-            frames = np.zeros((12, 8), np.uint8)
-            frames[motor] = np.frombuffer(data, np.uint8)
-            self.command[:, motor] = self.codec.decode_command(frames)[:, motor]
+            self.command[motor] = np.frombuffer(data, np.uint8)
 
     def _reply(self, motor: int, own_id: int) -> can.Message:
         """Return the reply of a motor."""
@@ -148,9 +146,10 @@ class BusSim:
     def sensors(self) -> list[can.Message]:
         """Return the frames of IMU and motion capture."""
         self.count += not self.imu_frozen
-        to_body = self.q[3:7] * CONJUGATE
-        force = rotate(to_body, self.acceleration + np.array([0.0, 0.0, EARTH])) + self._noise(self.accel_noise)
-        gyro = rotate(to_body, self.qd[3:6]) + self._noise(self.gyro_noise)
+        force = rotate(self.q[3:7], self.acceleration + np.array([0.0, 0.0, EARTH]), inverse=True)
+        gyro = rotate(self.q[3:7], self.qd[3:6], inverse=True)
+        force = force + self._noise(self.accel_noise)
+        gyro = gyro + self._noise(self.gyro_noise)
         frames = [pack_imu(gyro, GYRO_SCALE, self.count), pack_imu(force, ACCEL_SCALE, self.count)]
         if not self.capture_lost:
             frames += [
@@ -179,7 +178,7 @@ class BusSim:
 
     def advance(self) -> None:
         """Advance the simulation by a tick with the motors' present commands."""
-        position, velocity, kp, kd, feedforward = self.command
+        position, velocity, kp, kd, feedforward = self.codec.decode_command(self.command)
         on = self.enabled.astype(float)
         motors = self.sim.motors
         motors.kp.assign((on * kp)[:, None].astype(np.float32))

@@ -62,9 +62,7 @@ class Bundle:
         policy.interface["command_filter"] = fields["command_filter"]
         terms = fields["observations"]
         if list(terms) != list(policy.layout):
-            raise InputError(
-                f"{self.folder / FILE}: {fields['file']} observes {', '.join(policy.layout)}, in this order"
-            )
+            raise InputError(f"{self.folder / FILE}: {fields['file']} observes the terms {', '.join(policy.layout)}")
         for name, term in terms.items():
             width = (policy.layout[name]["end"] - policy.layout[name]["first"]) // policy.layout[name]["history"]
             if term["history_length"] * width != policy.layout[name]["end"] - policy.layout[name]["first"]:

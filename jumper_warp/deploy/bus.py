@@ -58,12 +58,13 @@ class UnixBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Return the next frame, or None after `timeout` [s], and that frames are not filtered."""
-        if timeout != 0.0:
-            select.select([self._socket], [], [], timeout)
         try:
-            arbitration_id, length, error, data = _FRAME.unpack(self._socket.recv(_FRAME.size))
+            packet = self._socket.recv(_FRAME.size)
         except BlockingIOError:
-            return None, False
+            if timeout == 0.0 or not select.select([self._socket], [], [], timeout)[0]:
+                return None, False
+            packet = self._socket.recv(_FRAME.size)
+        arbitration_id, length, error, data = _FRAME.unpack(packet)
         message = can.Message(
             arbitration_id=arbitration_id, data=data[:length], is_error_frame=bool(error), is_extended_id=False
         )

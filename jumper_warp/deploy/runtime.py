@@ -55,8 +55,9 @@ JUMPS = (State.JUMP_UP, State.JUMP_TO)
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
 TICK = np.dtype([
     ("received", RECEIVED), ("late", "f4"), ("request", "i1"), ("values", "f4", 3), ("sent", "u1", (12, 8)),
-    ("state", "i1"), ("fault", "i1"), ("fault_ticks", "i2"), ("target", "f4", 12), ("kp", "f4", 12), ("angle", "f4", 12),
-    ("rate", "f4", 12), ("torque", "f4", 12), ("position", "f4", 3), ("velocity", "f4", 3), ("quaternion", "f4", 4),
+    ("state", "i1"), ("fault", "i1"), ("fault_ticks", "i2"), ("target", "f4", 12), ("kp", "f4", 12),
+    ("angle", "f4", 12), ("rate", "f4", 12), ("torque", "f4", 12), ("position", "f4", 3),
+    ("velocity", "f4", 3), ("quaternion", "f4", 4),
     ("contact", "?", 4),
 ])  # fmt: skip
 """Record of a tick: what `Runtime.tick` received, what it sent before, and what it derived."""
@@ -273,10 +274,8 @@ class Runtime:
                 self._act(policy_due)
         elif self._procedure is not None:
             if isinstance(self._procedure, BallisticLanding):
-                known = not self.estimate.diverged and not self.stale
-                down = (
-                    self._contact.any() if known else np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0
-                )
+                loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]
+                down = loaded if self.estimate.diverged or self.stale else self._contact.any()
                 if self._procedure.step(bool(down)):
                     self._enter(State.DAMP)
                 return

@@ -28,9 +28,12 @@ NUDGE_AFTER, NUDGE_STEPS, NUDGE = 120, 30, np.array([0.25, 0.0, 0.0])
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray, *, inverse: bool = False) -> np.ndarray:
     """Return a vector (3,) rotated by a quaternion xyzw, or by its inverse."""
-    xyz, w = (-quaternion[:3] if inverse else quaternion[:3]), quaternion[3]
-    twice = 2.0 * np.cross(xyz, vector)
-    return vector + w * twice + np.cross(xyz, twice)
+    a, b, c, w = quaternion.tolist()
+    if inverse:
+        w = -w
+    x, y, z = vector.tolist()
+    u, v, t = 2.0 * (b * z - c * y), 2.0 * (c * x - a * z), 2.0 * (a * y - b * x)
+    return np.array([x + w * u + b * t - c * v, y + w * v + c * u - a * t, z + w * t + a * v - b * u])
 
 
 class Motion:

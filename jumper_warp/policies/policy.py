@@ -408,9 +408,8 @@ def bundle_onnx(policy: Policy, command_terms: Collection[str]) -> bytes:
 
     command_terms: names of observation terms that hold a command.
     """
-    data = onnx_bytes(
-        policy.tensors(), policy.interface, policy.config, reader_metadata(policy.interface, command_terms)
-    )
+    extra = reader_metadata(policy.interface, command_terms)
+    data = onnx_bytes(policy.tensors(), policy.interface, policy.config, extra)
     return data + checksum_entry(data)
 
 

@@ -22,9 +22,8 @@ def test_commands_are_bit_equal_to_cantools(database):
     commands[2] = np.minimum(commands[2], 499.8)  # kp stays one step below its full scale
     messages = [database.get_message_by_frame_id(i + 1) for i in range(3)]
     names = ("position", "velocity", "kp", "kd", "torque")
-    expected = [
-        messages[i % 3].encode(dict(zip(names, values, strict=True))) for i, values in enumerate(commands.T.tolist())
-    ]
+    rows = (dict(zip(names, values, strict=True)) for values in commands.T.tolist())
+    expected = [messages[i % 3].encode(row) for i, row in enumerate(rows)]
     assert codec.encode(commands).tobytes() == b"".join(expected)
 
 
