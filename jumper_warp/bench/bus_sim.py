@@ -45,6 +45,12 @@ class BusFaults:
     seed: int = 0
 
 
+def make_simulation(dt: float, friction: float = 0.85) -> Simulation:
+    """Return the simulation of a robot whose motors have no torque limit but their own; dt: physics step [s]."""
+    motors = jumping_motors(100.0)  # cut to the motors' peak torque
+    return Simulation(1, motors=motors, friction=friction, dt=dt, substeps=1, device="cpu", visuals=False)
+
+
 class BusSim:
     """Far end of four buses; `serve` answers the frames of a tick in lockstep, `answer` and `advance` do so apart."""
 
@@ -56,9 +62,7 @@ class BusSim:
         self.buses = list(buses)
         self.faults = BusFaults() if faults is None else faults
         self.dt = 1.0 / rate
-        self.sim = simulation or Simulation(
-            1, motors=jumping_motors(100.0), friction=friction, dt=self.dt, substeps=1, device="cpu", visuals=False
-        )
+        self.sim = simulation or make_simulation(self.dt, friction)
         self.codec = Codec([motor.type for motor in load_description().motors])
         self.rng = np.random.default_rng(self.faults.seed)
         self.command = np.zeros((12, 8), np.uint8)  # newest command frame of each motor
@@ -76,6 +80,15 @@ class BusSim:
         self.largest_torque = np.zeros(12)  # [N m] delivered by each motor so far
         self.gyro_noise = self.accel_noise = 0.0
         self._late: list[tuple[int, bytes]] = []
+        self._velocity = np.zeros(3)
+        self._read()
+
+    def restart(self) -> None:
+        """Stand in the default pose again, with motors off."""
+        self.sim.reset()
+        self.enabled[:] = False
+        self.command[:] = 0
+        self._late = []
         self._velocity = np.zeros(3)
         self._read()
 

@@ -275,8 +275,8 @@ class Runtime:
         elif self._procedure is not None:
             if isinstance(self._procedure, BallisticLanding):
                 loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]
-                down = loaded if self.estimate.diverged or self.stale else self._contact.any()
-                if self._procedure.step(bool(down)):
+                blind = self.estimate.diverged or (self.stale and not isinstance(self.source, MotionCapture))
+                if self._procedure.step(loaded if blind else self._contact.any(), blind):
                     self._enter(State.DAMP)
                 return
             self._target = self._procedure.step(self.motion)

@@ -3,7 +3,7 @@
 import pytest
 
 from jumper_warp.bench.bundle import export_bundle
-from jumper_warp.bench.bus_sim import BusSim
+from jumper_warp.bench.bus_sim import BusSim, make_simulation
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.runtime import Request, Runtime, State
@@ -42,17 +42,25 @@ class Robot:
         self.run(3)
         self.run(2, Request.STAND)
         self.runtime._enter(State.HOLD)
-        self.run(300)
+        self.run(48)
+
+
+@pytest.fixture(scope="session")
+def simulation():
+    """Simulation of the far end, with a physics step a tick."""
+    return make_simulation(1.0 / 480.0)
 
 
 @pytest.fixture
-def make_robot(bundle, tmp_path):
+def make_robot(bundle, simulation, tmp_path):
     """Function that makes a robot on simulated buses; arguments: of BusSim and Runtime."""
     robots = []
 
     def make(faults=None, **options):
         buses = open_buses(f"unix:{tmp_path}", "robot")
-        robots.append(Robot(bundle, tmp_path, BusSim(buses, faults), **options))
+        far = BusSim(buses, faults, simulation=simulation)
+        far.restart()
+        robots.append(Robot(bundle, tmp_path, far, **options))
         return robots[-1]
 
     yield make
