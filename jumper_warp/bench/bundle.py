@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import math
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from jumper_warp.bench.vectors import npz_bytes, vectors_of
 from jumper_warp.deploy.bundle import FILE, VERSION, settings_hash
+from jumper_warp.deploy.check import vectors_file
+from jumper_warp.deploy.codec import dbc
 from jumper_warp.policies.policy import Policy, bundle_onnx
 from jumper_warp.policies.spec import PolicyInterface
 from jumper_warp.robot.description import load_description
@@ -118,6 +123,22 @@ def robot_settings() -> dict[str, Any]:
     }
 
 
+def runtime_archive() -> bytes:
+    """Return the runtime as a zip archive that Python runs: `jumper_warp.deploy` and the modules that it imports."""
+    package = Path(__file__).parents[1]
+    modules = [*sorted((package / "deploy").glob("*.py")), package / "policies" / "spec.py"]
+    modules += [package / "utils" / f"{name}.py" for name in ("checks", "errors", "files")]
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("jumper_warp", "jumper_warp/policies", "jumper_warp/utils"):
+            archive.writestr(zipfile.ZipInfo(f"{name}/__init__.py"), "")
+        for path in modules:
+            info = zipfile.ZipInfo(f"jumper_warp/{path.relative_to(package)}")
+            archive.writestr(info, path.read_bytes(), zipfile.ZIP_DEFLATED)
+        archive.writestr(zipfile.ZipInfo("__main__.py"), "from jumper_warp.deploy.main import main\n\nmain()\n")
+    return file.getvalue()
+
+
 def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
     """Write a bundle of named policies to a folder, and return it.
 
@@ -132,6 +153,9 @@ def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
             raise InputError(f"{name}: the bundle already has a policy for {section['skill']}")
         sections[name] = section
         files[f"{name}.onnx"] = bundle_onnx(policy, SKILL_OF_COMMAND)
+        files[vectors_file(name)] = npz_bytes(vectors_of(name, policy))
+    files["jumper.dbc"] = dbc(settings["motors"][:3]).encode()
+    files["deploy.pyz"] = runtime_archive()
     settings["policies"] = sections
     return write_bundle(settings, files, folder)
 

@@ -104,8 +104,11 @@ class BusSim:
         self._velocity = velocity
         self.contact = np.linalg.norm(sim.paw_force.numpy()[:, 0], axis=-1) > CONTACT_FORCE
 
-    def serve(self) -> None:
-        """Answer the frames of a tick in lockstep, which end with SYNC on each bus, and advance the simulation."""
+    def serve(self) -> bool:
+        """Answer the frames of a tick in lockstep, which end with SYNC on each bus, and advance the simulation.
+
+        Returns False if the runtime has ended.
+        """
         late, self._late = self._late, []
         for motor, data in late:
             self._take(motor, data)
@@ -113,12 +116,15 @@ class BusSim:
         for number, bus in enumerate(self.buses):
             while (message := bus.recv(LOCKSTEP_TIMEOUT)) is not None and message.arbitration_id != SYNC:
                 answers[number] += self.answer(number, message)
+            if message is None:
+                return False
         answers[0] += self.sensors()
         for number, bus in enumerate(self.buses):
             for message in answers[number]:
-                self._send(bus, message)
+                self.send(bus, message)
             bus.send(can.Message(arbitration_id=SYNC, is_extended_id=False))
         self.advance()
+        return True
 
     def answer(self, number: int, message: can.Message) -> list[can.Message]:
         """Take a command on a bus, and return the motor's reply."""
@@ -181,7 +187,7 @@ class BusSim:
         """Return whether a frame is lost."""
         return bool(self.faults.drop) and self.rng.random() < self.faults.drop
 
-    def _send(self, bus: can.BusABC, message: can.Message) -> None:
+    def send(self, bus: can.BusABC, message: can.Message) -> None:
         """Send a frame unless it is lost; a corrupt one arrives as an error frame."""
         if self._lost():
             return

@@ -1,4 +1,4 @@
-"""`jumper export`: save the policy of a training run as a folder, or a policy as one ONNX file."""
+"""`jumper export`: save the policy of a training run as a folder, a policy as one ONNX file, or a robot's bundle."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ from types import ModuleType
 import tyro
 
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.errors import InputError
 
 
 @dataclass(frozen=True)
 class ExportCfg:
     """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
-    source: tyro.conf.Positional[str]
-    """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint."""
+    sources: tyro.conf.Positional[tuple[str, ...]]
+    """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint; several
+    of them with --bundle."""
     out: Path | None = None
     """ONNX file, or folder of the new policy (default: policy/ in the run's folder; of a policy <task>.onnx)."""
     newest: bool = False  # Export the newest checkpoint of a run, not the best
     overwrite: bool = False  # Replace an existing policy with its metrics and README
+    bundle: bool = False
+    """Write a folder for the robot: policies with their conformance vectors, deploy.yaml and the runtime deploy.pyz."""
     blend: tuple[str, float] | None = None
     """Second policy, and its weight, 0 to 1, in the weighted mean of both networks."""
 
@@ -51,7 +55,11 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
-    source = Path(newest_run(cfg.source))
+    if cfg.bundle:
+        return export_for_robot(cfg)
+    if len(cfg.sources) != 1:
+        raise InputError("give one policy, or several with --bundle")
+    source = Path(newest_run(cfg.sources[0]))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out, cfg.overwrite)
     trained = is_run(source)
@@ -72,3 +80,15 @@ def export(cfg: ExportCfg) -> Path:
         path = save_policy(out, policy, files=files, overwrite=cfg.overwrite)
     print(path)
     return path
+
+
+def export_for_robot(cfg: ExportCfg) -> Path:
+    """Write a bundle of several policies, print its folder and return it. Raises InputError: see `export_bundle`."""
+    from jumper_warp.bench.bundle import export_bundle
+    from jumper_warp.policies.policy import Policy, checked_folder
+
+    folder = cfg.out or Path("bundle")
+    checked_folder(folder, cfg.overwrite)
+    named = [(Path(source).name.replace("-", "_"), Policy.load(source, newest=cfg.newest)) for source in cfg.sources]
+    print(export_bundle(named, folder))
+    return folder

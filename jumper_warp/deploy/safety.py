@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost frame of a motor or of the IMU
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
@@ -21,7 +22,7 @@ class Fault(IntEnum):
     NONE = 0
     SILENT = 1  # a motor does not reply
     BUS_OFF = 2  # a bus cannot send
-    ERROR_FRAME = 3  # error frames on a bus
+    ERROR_FRAME = 3  # many error frames
     WRONG_ID = 4  # a frame of another id scheme
     MOTOR_ERROR = 5  # a motor reports an error
     TEMPERATURE = 6
@@ -53,6 +54,7 @@ class Safety:
         lower, upper = np.radians(settings["lower"]), np.radians(settings["upper"])
         margin = np.radians(settings["position_margin"])
         self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
+        self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted
 
@@ -67,6 +69,8 @@ class Safety:
         error: (12,). tilt: angle from upright [rad], 0 in flight. late: delay of the tick [s].
         """
         limits = self._limits
+        self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
+        age = int(self._ages.max())
         found = (
             (Fault.STOP, stop),
             (Fault.WRONG_ID, received["unknown"] > 0),
@@ -76,16 +80,16 @@ class Safety:
             (Fault.POSITION, ((q < self._lower) | (q > self._upper)).any()),
             (Fault.TILT, tilt > np.radians(limits["max_tilt"])),
             (Fault.BUS_OFF, received["bus_off"].any()),
-            (Fault.ERROR_FRAME, received["error_frames"] > 0),
-            (Fault.SILENT, not received["motor_fresh"].all()),
+            (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),
+            (Fault.SILENT, self._ages[:12].max() > 1),
             (Fault.TORQUE, (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()),
-            (Fault.STALE, stale),
+            (Fault.STALE, self._ages[12] > 1),
             (Fault.DIVERGED, diverged),
             (Fault.NOT_FINITE, not finite),
             (Fault.LATE, late > limits["max_late"]),
         )
         fault = next((fault for fault, present in found if present), Fault.NONE)
-        self.ticks = self.ticks + 1 if fault else 0
+        self.ticks = max(self.ticks + 1, age) if fault else 0
         self.fault = fault
         gone = late > (HOLD_TICKS + 1) * limits["max_late"] * 2.0
         return fault in ACTING or self.ticks > HOLD_TICKS or gone

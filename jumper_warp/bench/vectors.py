@@ -1,0 +1,122 @@
+"""Conformance vectors of a policy: 500 policy steps in simulation, as npz for a bundle and as JSON for a browser.
+
+Observations, actions and filtered targets are those of the environment that evaluates policies and of the PyTorch
+network. Readings are the newest frames of the observations.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import zlib
+
+import numpy as np
+
+from jumper_warp.deploy.codec import Codec, Reply
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
+from jumper_warp.policies.policy import Policy
+from jumper_warp.robot.description import load_description
+from jumper_warp.sim.simulation import motor_values
+from jumper_warp.utils.assets import ASSETS
+
+STEPS, EPISODES = 500, 4
+OBSERVATION_EVERY = 10  # policy steps between two recorded observations
+FRAMES = 40  # policy steps with the motors' frames
+COMMAND_STEP = 30.0  # policy step of the command to jump
+COMMANDS = {
+    "wanted_height": ([0.0, 0.0, 0.6], [0.0, 0.0, 0.75], [0.0, 0.0, 0.9], [0.0, 0.0, 1.0]),
+    "goal": ([0.8, 0.2, 0.0], [1.2, 0.0, 0.0], [0.3, -0.3, 0.0], [-0.3, 0.1, 0.0]),
+    "command": ([0.5, 0.0, 0.0], [0.3, 0.2, 0.5], [-0.3, 0.0, -0.5], [0.8, -0.1, 0.2]),
+}
+"""Commands of the episodes by observation term of the command."""
+
+
+def record_vectors(policy: Policy, episodes: int = EPISODES, steps: int = STEPS) -> dict[str, np.ndarray]:
+    """Return the vectors of a policy: arrays by name, with a row a policy step; see docs/reference/bundle.md."""
+    layout = policy.interface.observation_layout
+    term = next(name for name in COMMANDS if name in layout)
+    env = env_of_recipe(policy.recipe(), 1, Conditions(device="cpu"))
+    names = [name for name in layout if name != "last_action"]
+    rows: dict[str, list] = {name: [] for name in ("observation", "action", "target", "reset", "angle", "rate")}
+    rows |= {f"reading_{name}": [] for name in names}
+    for step in range(steps):
+        episode, within = divmod(step, steps // episodes)
+        if within == 0 and episode < episodes:
+            command = COMMANDS[term][episode]
+            row = command if term == "command" else [*command, COMMAND_STEP]
+            env.evaluation_reset([row], 0.5)
+        obs = env.obs.clone()
+        action = policy.act(obs)
+        angle = motor_values(env.sim.joint_q()[0, 7:]).copy()
+        rate = motor_values(env.sim.joint_qd()[0, 6:]).copy()
+        for name in names:
+            width = (layout[name]["end"] - layout[name]["first"]) // layout[name]["history"]
+            frame = obs[0, layout[name]["end"] - width : layout[name]["end"]].numpy() / layout[name]["scale"]
+            rows[f"reading_{name}"].append({"angle": angle, "rate": rate}.get(name, frame))
+        env.step(action)
+        target = env.robot.filtered_target.numpy()[:, 0].copy()
+        values = (obs[0].numpy(), action[0].numpy(), target, within == 0 and episode < episodes, angle, rate)
+        for name, value in zip(("observation", "action", "target", "reset", "angle", "rate"), values, strict=True):
+            rows[name].append(value)
+    arrays = {name: np.array(values) for name, values in rows.items()}
+    vectors = _frames(arrays, policy)
+    vectors |= {name: arrays[name].astype(np.float32) for name in arrays if name.startswith("reading_")}
+    vectors["observation"] = arrays["observation"][::OBSERVATION_EVERY].astype(np.float32)
+    vectors |= {name: arrays[name].astype(np.float32) for name in ("action", "target")}
+    vectors["reset"] = arrays["reset"]
+    vectors["observation_every"] = np.array(OBSERVATION_EVERY)
+    return vectors
+
+
+def _frames(arrays: dict[str, np.ndarray], policy: Policy) -> dict[str, np.ndarray]:
+    """Return the motors' frames of the first policy steps, gains, and names; motor 3 · leg + j is joint 3 · leg + j."""
+    motors = [motor.type for motor in load_description().motors]
+    codec = Codec(motors)
+    spec = policy.interface
+    zero = np.zeros(12)
+    replies, commands = [], []
+    for step in range(min(FRAMES, len(arrays["action"]))):
+        reply = Reply(arrays["angle"][step], arrays["rate"][step], zero, zero + 35.0, zero.astype(int))
+        replies.append(codec.encode_reply(np.tile([1, 2, 3], 4), reply))
+        rows = [arrays["target"][step], zero, spec.joint_stiffness, spec.joint_damping, zero]
+        commands.append(codec.encode(np.array(rows, dtype=float)))
+    decoded = [codec.decode_reply(frames) for frames in replies]
+    return {
+        "motors": np.array(motors), "joint_names": np.array(spec.joint_names),
+        "gains": np.array([spec.joint_stiffness, spec.joint_damping, spec.torque_limit], dtype=np.float32),
+        "replies": np.array(replies), "commands": np.array(commands),
+        "reply_angle": np.array([each.position for each in decoded], dtype=np.float32),
+        "reply_rate": np.array([each.velocity for each in decoded], dtype=np.float32),
+    }  # fmt: skip
+
+
+def vectors_of(name: str, policy: Policy) -> dict[str, np.ndarray]:
+    """Return the vectors of a policy: those of the project's policy of this name, else recorded ones."""
+    shipped = (ASSETS / "conformance") / f"{name}.npz"
+    if not shipped.is_file():
+        return record_vectors(policy)
+    with np.load(shipped, allow_pickle=False) as file:
+        return {key: file[key] for key in file.files}
+
+
+def npz_bytes(vectors: dict[str, np.ndarray]) -> bytes:
+    """Return vectors as a compressed npz file."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **vectors)
+    return file.getvalue()
+
+
+def json_text(vectors: dict[str, np.ndarray]) -> str:
+    """Return vectors as JSON: each array with dtype, shape and its bytes, compressed by zlib, in base64.
+
+    Bytes are little-endian, the last index fastest; texts are lists.
+    """
+    content = {}
+    for name, array in vectors.items():
+        if array.dtype.kind == "U":
+            content[name] = array.tolist()
+        else:
+            data = base64.b64encode(zlib.compress(np.ascontiguousarray(array).tobytes(), 9)).decode()
+            content[name] = {"dtype": str(array.dtype), "shape": list(array.shape), "zlib_base64": data}
+    return json.dumps(content) + "\n"

@@ -1,0 +1,130 @@
+"""`jumper deploy BUNDLE` and `python deploy.pyz BUNDLE`: check a bundle, run the robot, or replay a log."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jumper_warp.deploy.bundle import Bundle
+from jumper_warp.deploy.bus import Link, open_buses
+from jumper_warp.deploy.check import check_bundle
+from jumper_warp.deploy.log import Log, read_log, replay
+from jumper_warp.deploy.operator import HELP, Command, Keyboard, Script, raw_terminal
+from jumper_warp.deploy.realtime import request_real_time, run_loop
+from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.watchdog import Watchdog
+from jumper_warp.utils.errors import InputError
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    flags = argparse.ArgumentParser("jumper deploy", description="Run policies on the robot.", epilog=HELP)
+    flags.formatter_class = argparse.RawDescriptionHelpFormatter
+    flags.add_argument("bundle", type=Path, help="folder of jumper export POLICY ... --bundle")
+    flags.add_argument("--check", action="store_true", help="compare the bundle with its conformance vectors, and end")
+    flags.add_argument("--replay", type=Path, metavar="LOG", help="run a log through the runtime, and compare commands")
+    flags.add_argument("--bus", help="socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER")
+    flags.add_argument("--rate", type=int, choices=(480, 500), help="ticks a second (default: of deploy.yaml)")
+    flags.add_argument("--dry-run", action="store_true", help="compute commands, and keep the motors off")
+    flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
+    flags.add_argument("--seconds", type=float, default=float("inf"), help="[s] end after this time")
+    flags.add_argument("--demo", action="store_true", help="stand up, walk and jump without an operator (bus-sim only)")
+    flags.add_argument("--height", type=float, default=0.7, help="[m] height of the base in jumps up (key j)")
+    flags.add_argument("--place", type=float, nargs=2, default=(0.5, 0.0), help="[m] ahead and left (key g)")
+    flags.add_argument("--log", type=Path, help="folder for the log")
+    flags.add_argument("--no-watchdog", action="store_true", help="start no watchdog process")
+    return flags
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command; exits with 1 if a check fails, and with 2 and one line if the input is invalid."""
+    options = parser().parse_args(args)
+    try:
+        bundle = Bundle(options.bundle)
+        if bundle.edited:
+            print("deploy.yaml was edited after the export: check it with --check", file=sys.stderr)
+        if options.check:
+            _check(bundle)
+        elif options.replay is not None:
+            _replay(bundle, options.replay)
+        elif options.bus:
+            run(bundle, options)
+        else:
+            raise InputError("--bus, --check or --replay is needed")
+    except InputError as error:
+        print(f"jumper deploy: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def _check(bundle: Bundle) -> None:
+    """Print the differences of a bundle from its vectors; exits with 1 if there are any."""
+    differences = check_bundle(bundle)
+    print("\n".join(differences or [f"{len(bundle.policies)} policies conform"]))
+    if differences:
+        raise SystemExit(1)
+
+
+def _replay(bundle: Bundle, folder: Path) -> None:
+    """Print whether the runtime repeats the commands of a log; exits with 1 if not."""
+    ticks, rate = read_log(folder)
+    first = replay(ticks, bundle, rate)
+    print(f"{len(ticks)} ticks repeat bit for bit" if first < 0 else f"tick {first} differs")
+    if first >= 0:
+        raise SystemExit(1)
+
+
+def demo() -> list[tuple[float, Request, tuple[float, float, float]]]:
+    """Return requests that let the robot stand up, walk and jump, with their times [s]."""
+    none = (0.0, 0.0, 0.0)
+    return [
+        (0.5, Request.STAND, none), (0.7, Request.CONFIRM, none), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
+        (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
+    ]  # fmt: skip
+
+
+def run(bundle: Bundle, options: argparse.Namespace) -> None:
+    """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
+    rate = options.rate or int(bundle.settings["rate"])
+    log = None if options.log is None else Log(options.log, bundle, rate)
+    link = Link(
+        open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], lockstep=options.lockstep,
+        deadline=0.5 / rate, listener=None if log is None else log.frame,
+    )  # fmt: skip
+    runtime = Runtime(bundle, link, rate=rate, dry_run=options.dry_run, listener=None if log is None else log.tick)
+    dog = None if options.no_watchdog or options.lockstep else Watchdog(options.bus, bundle.settings)
+    operator = Script(demo(), rate) if options.demo else Keyboard(options.height, tuple(options.place))
+    last = State.PASSIVE
+
+    def tick(late: float) -> bool:
+        """Run a tick with the operator's request, and print changes of the state."""
+        nonlocal last
+        command: Command = operator.poll()
+        runtime.tick(*command, late=0.0 if options.lockstep else late)
+        if dog is not None:
+            dog.beat()
+        if runtime.state != last:
+            last = runtime.state
+            print(f"{last.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
+        return True
+
+    try:
+        with raw_terminal():
+            if options.lockstep:
+                for _ in range(round(options.seconds * rate)):
+                    tick(0.0)
+            else:
+                request_real_time()
+                print(json.dumps(run_loop(tick, rate, options.seconds)))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+            runtime.tick(request)
+        if dog is not None:
+            dog.close()
+        link.close()
+        if log is not None:
+            log.close()
