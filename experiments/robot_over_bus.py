@@ -9,9 +9,11 @@ the true state, with the motors' torque limits. `--drop 0.01` loses frames, `--d
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.runtime import Request, Runtime, State
 from jumper_warp.deploy.sensors import Estimate
-from jumper_warp.deploy.skills import Motion, rotate
+from jumper_warp.deploy.skills import Motion, Walk, rotate
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.motors import jumping_motors, walking_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
@@ -70,9 +72,7 @@ class Bench:
         """Return a runtime whose robot stands in the default pose, with motors on."""
         source = None
         if self.args.estimator:
-            from jumper_warp.deploy.estimator import Estimator
-
-            source = Estimator()
+            source = importlib.import_module("jumper_warp.deploy.estimator").Estimator()
         self.far.restart()
         runtime = Runtime(self.bundle, self.link, source, rate=self.args.rate)
         runtime.tick()
@@ -102,12 +102,12 @@ class Bench:
         sim = self.direct[state]
         sim.reset()
         runtime = Runtime(self.bundle, self.link)
-        skill, motion, rows = runtime.skills[state], Motion(), []
+        skill, motion, rows = runtime.skills[state], Motion(self.bundle.settings["switch"]), []
         read_state(sim, motion)
         skill.begin(commands[0], motion)
         for command in commands:
             if state == State.WALK:
-                skill.wanted = command
+                cast("Walk", skill).wanted = command
             for _ in range(steps):
                 read_state(sim, motion)
                 sim.set_targets(skill.targets(motion))

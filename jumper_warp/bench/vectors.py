@@ -103,7 +103,7 @@ def vectors_of(name: str, policy: Policy) -> dict[str, np.ndarray]:
 def npz_bytes(vectors: dict[str, np.ndarray]) -> bytes:
     """Return vectors as a compressed npz file."""
     file = io.BytesIO()
-    np.savez_compressed(file, **vectors)
+    np.savez_compressed(file, allow_pickle=False, **vectors)
     return file.getvalue()
 
 

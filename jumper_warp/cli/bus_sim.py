@@ -17,7 +17,7 @@ class BusSimCfg:
     """unix:FOLDER or udp_multicast:PORT, as of jumper deploy, or socketcan:vcan0,vcan1,vcan2,vcan3."""
     lockstep: bool = False  # Wait for the runtime's frames at every tick, in place of real time
     rate: int = 480  # [Hz] Ticks a second
-    seconds: float = float("inf")  # [s] End after this time
+    seconds: float = 3600.0  # [s] End after this time
     friction: float = 0.85  # [1] Of the paws
     drop: float = 0.0  # Probability that a frame is lost
     corrupt: float = 0.0  # Probability that a frame arrives as an error frame

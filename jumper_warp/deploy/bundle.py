@@ -91,9 +91,9 @@ class JointMap:
         frames: replies of the motors, (12, 8) uint8. The first three are float32.
         """
         position, velocity, torque, temperature, error = (each[self.motor] for each in self.codec.decode_reply(frames))
-        angle = self.sign * position + self.offset
-        values = (each.astype(np.float32) for each in (angle, self.sign * velocity, self.sign * torque))
-        return *values, temperature, error
+        angle = (self.sign * position + self.offset).astype(np.float32)
+        rate = (self.sign * velocity).astype(np.float32)
+        return angle, rate, (self.sign * torque).astype(np.float32), temperature, error
 
     def frames(self, target: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> np.ndarray:
         """Return the motors' command frames (12, 8) uint8; target [rad], kp, kd: (12,), by joint."""

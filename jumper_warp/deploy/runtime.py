@@ -87,13 +87,13 @@ class Runtime:
         self.dt = 1.0 / rate
         self.dry_run = dry_run
         self.listener = listener
-        self.safety = Safety(bundle.settings["safety"])
-        self.motion = Motion()
+        self.safety = Safety(bundle.settings["safety"], bundle.settings["closed_chain"]["transversal_sum"])
+        self.motion = Motion(bundle.settings["switch"])
         self.skills: dict[State, Skill] = {}
         for name, policy in bundle.policies.items():
             fields = bundle.settings["policies"][name]
             state, kind = SKILLS[fields["skill"]]
-            self.skills[state] = kind(policy, Gains.from_yaml(fields))
+            self.skills[state] = kind(policy, Gains.from_yaml(fields), fields["commands"])
         self.damping = np.array(bundle.settings["safety"]["damping"], dtype=np.float32)
         self.off = np.tile(np.frombuffer(EXIT, np.uint8), (12, 1))
         self.frames = self.off
@@ -220,7 +220,7 @@ class Runtime:
         elif request == Request.CONFIRM and state == State.HOLD:
             self._procedure = SignTest(self.bundle.default, self.dt)
         elif request == Request.WALK and state == State.WALK:
-            self.skill.wanted = values
+            self.skill.wanted = np.clip(values, self.skill.lowest, self.skill.highest)
         elif request == Request.WALK and state == State.HOLD and State.WALK in self.skills:
             self._enter(State.WALK, values)
         elif request in (Request.JUMP_UP, Request.JUMP_TO) and state in (State.WALK, State.HOLD):
@@ -243,7 +243,8 @@ class Runtime:
         self._finite = True
         self.state = state
         if state in self.skills:
-            self.skill.begin(np.array(values, dtype=float), self.motion)
+            skill = self.skill
+            skill.begin(np.clip(np.array(values, dtype=float), skill.lowest, skill.highest), self.motion)
             self._gains = self.skill.gains
             self._due = self._time - self._step  # the policy acts in this tick
         else:
@@ -264,10 +265,9 @@ class Runtime:
             try:
                 target = self.skill.targets(self.motion)
                 self._finite = bool(np.isfinite(target).all())
+                self._target = target if self._finite else self._target
             except InputError:
                 self._finite = False
-            if self._finite:
-                self._target = target
             if self.skill.done:
                 back = State.WALK if State.WALK in self.skills and self.state != State.WALK else State.HOLD
                 self._enter(back)
@@ -276,7 +276,7 @@ class Runtime:
             if isinstance(self._procedure, BallisticLanding):
                 loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]
                 blind = self.estimate.diverged or (self.stale and not isinstance(self.source, MotionCapture))
-                if self._procedure.step(loaded if blind else self._contact.any(), blind):
+                if self._procedure.step(bool(loaded if blind else self._contact.any()), blind):
                     self._enter(State.DAMP)
                 return
             self._target = self._procedure.step(self.motion)

@@ -6,7 +6,7 @@ HOLD_TICKS ticks; in the next tick the policy ends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -48,12 +48,13 @@ ACTING = {
 class Safety:
     """Checks of every tick."""
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
-        """Read the section safety of deploy.yaml."""
+    def __init__(self, settings: Mapping[str, Any], transversal_sum: Sequence[float]) -> None:
+        """Read the section safety of deploy.yaml; transversal_sum: limits of outer + inner angle [deg]."""
         self._limits = settings
         lower, upper = np.radians(settings["lower"]), np.radians(settings["upper"])
         margin = np.radians(settings["position_margin"])
         self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
+        self._sum = np.radians(transversal_sum) + [-margin, margin]
         self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted
@@ -71,13 +72,15 @@ class Safety:
         limits = self._limits
         self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
         age = int(self._ages.max())
+        sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
+        beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
         found = (
             (Fault.STOP, stop),
             (Fault.WRONG_ID, received["unknown"] > 0),
             (Fault.MOTOR_ERROR, (error != 0).any()),
             (Fault.TEMPERATURE, (temperature > limits["max_temperature"]).any()),
             (Fault.SPEED, (np.abs(qd) > limits["max_rate"]).any()),
-            (Fault.POSITION, ((q < self._lower) | (q > self._upper)).any()),
+            (Fault.POSITION, beyond),
             (Fault.TILT, tilt > np.radians(limits["max_tilt"])),
             (Fault.BUS_OFF, received["bus_off"].any()),
             (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),

@@ -6,6 +6,7 @@ follows once the robot rests after landing.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,6 @@ STAND_STEPS = 18  # policy steps of contact of each paw of a standing robot
 LANDED_STEPS, RECOVER_STEPS, NO_JUMP_STEPS = 18, 60, 150
 """Policy steps after landing before which a jump never ends, after which it ends, and after which it ends without one.
 """
-REST_SPEED, REST_SPIN, REST_TILT = 0.10, 0.30, 0.14  # [m/s], [rad/s], [rad] of a robot at rest, at most
-MAX_OFFSET = 0.44  # [rad] of a joint from the default pose, to be near it
 SLEW_RATE = 1.25  # [m/s²], [rad/s²] of the commanded velocity
 NUDGE_AFTER, NUDGE_STEPS, NUDGE = 120, 30, np.array([0.25, 0.0, 0.0])
 """A robot that waits for a jump without coming to rest walks every 120 policy steps, for 30, with this velocity."""
@@ -39,8 +38,9 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray, *, inverse: bool = False)
 class Motion:
     """Readings of a policy step that all skills share, and how long the paws have been down."""
 
-    def __init__(self) -> None:
-        """Start without readings."""
+    def __init__(self, switch: Mapping[str, float]) -> None:
+        """Start without readings; switch: section of deploy.yaml, limits of a robot at rest near the default pose."""
+        self.switch = switch
         self.stood = 0  # policy steps for which all paws have been down
 
     def update(self, estimate: Estimate, gyro: np.ndarray, q: np.ndarray, qd: np.ndarray) -> None:
@@ -59,8 +59,9 @@ class Motion:
     @property
     def at_rest(self) -> bool:
         """Whether the robot stands still."""
-        slow = np.linalg.norm(self.velocity) < REST_SPEED and np.linalg.norm(self.gyro) < REST_SPIN
-        return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(REST_TILT))
+        switch = self.switch
+        slow = np.linalg.norm(self.velocity) < switch["rest_speed"] and np.linalg.norm(self.gyro) < switch["rest_spin"]
+        return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(switch["rest_tilt"]))
 
     def readings(self) -> dict[str, Any]:
         """Return the readings of `DeployedPolicy.targets` that do not depend on the command."""
@@ -73,9 +74,11 @@ class Motion:
 class Skill:
     """A policy with its gains; `targets` returns the filtered targets of a policy step."""
 
-    def __init__(self, policy: DeployedPolicy, gains: Gains) -> None:
-        """Take the policy and its gains."""
+    def __init__(self, policy: DeployedPolicy, gains: Gains, ranges: Mapping[str, Any]) -> None:
+        """Take the policy, its gains, and the lowest and highest value of each component of the command."""
         self.policy = policy
+        limits = [*ranges.values(), *[(0.0, 0.0)] * 3][:3]
+        self.lowest, self.highest = np.array(limits, dtype=float).T
         self.gains = gains
         self.done = False  # whether the skill has ended
 
@@ -121,7 +124,7 @@ class Walk(Skill):
         self.waited += 1
         nudged = self.waited >= NUDGE_AFTER and self.waited % NUDGE_AFTER < NUDGE_STEPS
         self.wanted = NUDGE if nudged else np.zeros(3)
-        near = np.abs(motion.q - self.policy.default).max() < MAX_OFFSET
+        near = np.abs(motion.q - self.policy.default).max() < motion.switch["max_offset"]
         return bool(motion.at_rest and not self.velocity.any() and near)
 
 
