@@ -102,7 +102,7 @@ def play_log(cfg: LogCfg) -> Path:
     ticks, rate = read_log(cfg.log)
     simulated = simulated_again(ticks, rate)
     sim = Simulation(2, motors=jumping_motors(), device="cpu")
-    recorder = Recorder(sim.model, notes={"log": str(cfg.log)}, labels=["log", "simulation"])
+    recorder = Recorder(sim.model, (0, 1), spacing=1.0, notes={"log": str(cfg.log)}, labels=["log", "simulation"])
     for number in range(0, len(ticks), max(1, rate // 60)):
         q = np.tile(simulated[number], (2, 1))
         q[0, :3], q[0, 3:7] = ticks["position"][number], ticks["quaternion"][number]
