@@ -33,7 +33,7 @@ from support.scripts import OutputArgs, run_script
 
 POLICIES = {State.JUMP_UP: "vertical_jump", State.JUMP_TO: "horizontal_jump", State.WALK: "walking_flat"}
 TOLERANCE = 0.1  # [m] of apex and landing
-FALLEN = 0.15  # [m] height of a base that has fallen
+LOWEST, MOST_TILT = 0.10, np.radians(60.0)  # [m], [rad] height and tilt of a base beyond which it has fallen
 COMMAND_SECONDS = 3.0  # [s] for which each random velocity is commanded
 
 
@@ -93,7 +93,10 @@ class Bench:
                 for _ in range(round(self.args.rate / 60)):
                     runtime.tick()
                 rows.append([*self.far.q[:7], *self.far._velocity])
+                if runtime.state != state:  # a jump ends, or a fault
+                    break
             if runtime.state == State.DAMP:
+                print(f"{state.name} {command}: {runtime.reason.name}")
                 break
         return trajectory(rows)
 
@@ -163,10 +166,16 @@ def trajectory(rows: list) -> dict[str, np.ndarray]:
     }
 
 
+def fallen(run: dict[str, np.ndarray]) -> bool:
+    """Return whether the robot falls in a trajectory: its base is too low or tilted."""
+    x, y = run["quaternion"][:, :2].T
+    return bool(run["position"][:, 2].min() < LOWEST or (1.0 - 2.0 * (x**2 + y**2)).min() < np.cos(MOST_TILT))
+
+
 def jump_error(state: State, command: np.ndarray, run: dict[str, np.ndarray]) -> float:
     """Return the error of a jump's apex or place [m], infinite after a fall."""
     position = run["position"]
-    if position[-1, 2] < FALLEN:
+    if fallen(run):
         return np.inf
     if state == State.JUMP_UP:
         return abs(float(position[:, 2].max()) - command[0])
@@ -175,7 +184,7 @@ def jump_error(state: State, command: np.ndarray, run: dict[str, np.ndarray]) ->
 
 def tracking_error(run: dict[str, np.ndarray], commands: np.ndarray, steps: int) -> float:
     """Return the RMS error of the walking velocity [m/s], a second after each command; infinite after a fall."""
-    if run["position"][:, 2].min() < FALLEN:
+    if fallen(run):
         return np.inf
     errors = []
     for i in range(len(run["position"])):

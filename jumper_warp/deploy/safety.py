@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost frame of a motor or of the IMU
+STRAINED_TICKS = 12  # Ticks beyond its torque limit that a motor may need in a landing
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
@@ -39,8 +40,8 @@ class Fault(IntEnum):
 
 
 ACTING = {
-    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.SPEED, Fault.POSITION, Fault.TILT, Fault.STOP,
-    Fault.SIGN,
+    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.TORQUE, Fault.SPEED, Fault.POSITION, Fault.TILT,
+    Fault.STOP, Fault.SIGN,
 }  # fmt: skip
 """Faults that end the policy at once."""
 
@@ -56,6 +57,7 @@ class Safety:
         self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
         self._sum = np.radians(transversal_sum) + [-margin, margin]
         self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
+        self._strained = np.zeros(12, int)  # ticks for which each motor has exceeded its torque limit
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted
 
@@ -72,6 +74,8 @@ class Safety:
         limits = self._limits
         self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
         age = int(self._ages.max())
+        strained = np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]
+        self._strained = np.where(strained, self._strained + 1, 0)
         sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
         beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
         found = (
@@ -85,7 +89,7 @@ class Safety:
             (Fault.BUS_OFF, received["bus_off"].any()),
             (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),
             (Fault.SILENT, self._ages[:12].max() > 1),
-            (Fault.TORQUE, (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()),
+            (Fault.TORQUE, self._strained.max() >= STRAINED_TICKS),
             (Fault.STALE, self._ages[12] > 1),
             (Fault.DIVERGED, diverged),
             (Fault.NOT_FINITE, not finite),

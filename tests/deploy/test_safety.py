@@ -116,7 +116,7 @@ FAULTS = {
     "error frames": (error_frames, Fault.ERROR_FRAME, 5, {}),
     "over-temperature": (over_temperature, Fault.TEMPERATURE, 1, {}),
     "motor error": (motor_error, Fault.MOTOR_ERROR, 1, {}),
-    "torque": (torque, Fault.TORQUE, 5, {}),
+    "torque": (torque, Fault.TORQUE, 12, {}),
     "speed": (speed, Fault.SPEED, 1, {}),
     "position": (position, Fault.POSITION, 1, {}),
     "tilt": (tilt, Fault.TILT, 2, {}),  # the state is a tick old
