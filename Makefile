@@ -21,7 +21,7 @@ wheel: ## build dist/jumper_warp-VERSION-py3-none-any.whl
 
 test: $(STAMP) ## run all tests, and check the import rules
 	$(VENV)/bin/lint-imports --no-logo
-	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
+	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 docs: $(STAMP) ## build the documentation site in docs/_build/html; warnings are errors
 	$(VENV)/bin/python -m sphinx -b html -q -W --keep-going -j 2 docs docs/_build/html

@@ -21,6 +21,11 @@ settings.register_profile("tests", deadline=None, derandomize=True, suppress_hea
 settings.load_profile("tests")  # a loaded machine is no failure
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
 """Tasks whose kernels many files use, in addition to `hold_height`."""
+LONGEST = (
+    "test_pages_howto.py", "test_pages_tutorials.py", "test_sysid.py", "test_drive_in_browser.py", "test_sweep.py",
+    "test_finetuning.py", "test_identification.py", "test_extras.py", "test_torchrun.py", "test_exported_robot.py",
+)  # fmt: skip
+"""Files that begin first, so that at the end no worker waits for a long one; with --no-loadscope-reorder."""
 MUJOCO_STEP = """
 import warp as wp
 from jumper_warp.sim.simulation import Simulation
@@ -37,6 +42,22 @@ def pytest_sessionstart(session):
             for name in SHARED:
                 Env(hardest(make_task(name)), 2, device="cpu").compile()  # with a small map
             Env(hold_height(), 2, device="cpu").compile()
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered_tasks():
+    """Remove the tasks that a module's tests register, which other modules do not expect."""
+    from jumper_warp.registry import TASKS
+
+    before = dict(TASKS)
+    yield
+    TASKS.clear()
+    TASKS.update(before)
 
 
 @pytest.fixture(scope="module")

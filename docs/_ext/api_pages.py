@@ -29,7 +29,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "tasks.observations", "tasks.mirror", "tasks.saving",
     )),
     "gradients": ("Gradients", (
-        "diff.rollout", "diff.torch_rollout", "diff.closed_loop",
+        "diff.rollout", "diff.torch_rollout", "envs.gradients", "envs.gradient_check",
     )),
     "training": ("Training", (
         "rl.cfg", "rl.runner", "rl.learner", "rl.torch.ppo", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",

@@ -10,24 +10,27 @@ from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from jumper_warp.cli.compare import CompareCfg
-from jumper_warp.cli.completion import CompletionCfg, settings_of
+from jumper_warp.cli.doctor import DoctorCfg
 from jumper_warp.cli.drive import DriveCfg
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
 from jumper_warp.cli.export import ExportCfg
 from jumper_warp.cli.export_robot import ExportRobotCfg
 from jumper_warp.cli.flags import Flag, list_flags
-from jumper_warp.cli.list import RunsCfg
+from jumper_warp.cli.info import InfoCfg
+from jumper_warp.cli.list import ListCfg, RunsCfg
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.rescore import RescoreCfg
 from jumper_warp.cli.sweep import SweepCfg
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
-from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.cli.train import SHORT_HELP, TrainArgs
 from jumper_warp.cli.try_task import TryCfg
+from jumper_warp.cli.watch import WatchArgs
 from jumper_warp.evaluation.agents import AgentCfg
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
+from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import make_task
 from plain_text import to_markdown
@@ -48,13 +51,13 @@ FULL_LIST = 10  # Largest number of flags without a second list
 
 
 def cli_page() -> str:
-    """Return the Markdown of the command reference: a section for each command, then completion and exit codes."""
-    train, stock = settings_of("train")[0], stock_evaluations()
+    """Return the Markdown of the command reference: a section for each command, then exit codes."""
+    stock = stock_evaluations()
     parts = [
-        section("train TASK", COMMANDS["train"], list_flags(train), headings={"Common flags": SHORT_HELP},
+        section("train TASK", COMMANDS["train"], list_flags(TrainArgs), headings={"Common flags": SHORT_HELP},
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
-        section("watch RUN", doc(settings_of("watch")[0]), list_flags(settings_of("watch")[0])),
-        section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
+        section("watch RUN", doc(WatchArgs), list_flags(WatchArgs)),
+        section("finetune POLICY", COMMANDS["finetune"], list_flags(FinetuneArgs)),
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
                  {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg),
@@ -72,13 +75,12 @@ def cli_page() -> str:
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
         section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
-        section("list", COMMANDS["list"], list_flags(settings_of("list")[0])),
+        section("list", COMMANDS["list"], list_flags(ListCfg)),
         section("list runs", doc(RunsCfg), list_flags(RunsCfg)),
-        section("info NAME", COMMANDS["info"], list_flags(settings_of("info")[0])),
-        section("doctor", COMMANDS["doctor"], list_flags(settings_of("doctor")[0])),
-        section("completion SHELL", COMMANDS["completion"], list_flags(CompletionCfg)),
+        section("info NAME", COMMANDS["info"], list_flags(InfoCfg)),
+        section("doctor", COMMANDS["doctor"], list_flags(DoctorCfg)),
     ]  # fmt: skip
-    return "\n\n".join([summary(), *parts, completion(), exit_codes()]) + "\n"
+    return "\n\n".join([summary(), *parts, exit_codes()]) + "\n"
 
 
 def summary() -> str:
@@ -87,7 +89,7 @@ def summary() -> str:
         "train": "train-task", "watch": "watch-run", "finetune": "finetune-policy", "play": "play-policy",
         "drive": "drive-policy",
         "evaluate": "evaluate-policy",
-        "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
+        "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name",
         "compare": "compare-a-b", "rescore": "rescore-recording", "sweep": "sweep-file", "try": "try-file",
     }  # fmt: skip
     rows = [
@@ -202,14 +204,6 @@ def dropdown(title: str, content: str) -> str:
 def paragraph(text: str) -> str:
     """Return a command's description as Markdown."""
     return to_markdown(" ".join(text.split(": jumper ")[0].rstrip(".").split()) + ".")
-
-
-def completion() -> str:
-    """Return the section about shell completion, from the docstring of its settings."""
-    lines = [line.strip() for line in doc(CompletionCfg).splitlines() if ": jumper " in line]
-    commands = "\n".join(line.partition(": ")[2] for line in lines)
-    shells = " and ".join(line.partition(":")[0] for line in lines)
-    return f"## Shell completion\n\nFor {shells}:\n\n```bash\n{commands}\n```"
 
 
 def exit_codes() -> str:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -16,6 +16,7 @@ from jumper_warp.cli.flags import values_of
 from jumper_warp.cli.main import UsageError, parse
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.registry import load_task_module
+from jumper_warp.utils.checks import check_count, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_file
 
@@ -41,54 +42,83 @@ class CompareCfg:
     """Conditions of the evaluation."""
 
 
+@dataclass(frozen=True)
+class ArmsFile:
+    """Settings file of arms to train and compare."""
+
+    arms: Json  # By name: flags of `jumper train`, or a table of task and flags
+    seeds: tuple[int, ...]  # Seeds of each arm
+    task: str = ""  # Task of the arms that are no table
+    flags: str = ""  # Flags of `jumper train` for all arms
+    log_root: str = "logs"  # Folder of the runs
+    modules: tuple[str, ...] = ()  # Files of tasks, relative to this file
+    title: str = "Comparison"
+    primary: str = ""  # Metric to test
+    evaluation: Json = field(default_factory=dict)  # Flags of `jumper evaluate` by name
+    conditions: Any = field(default_factory=dict)  # Conditions of the evaluation by name
+
+    def __post_init__(self) -> None:
+        """Raise InputError: a field is invalid, or there are no seeds. TypeError: there is no such condition."""
+        check_types("arms:", self)
+        check_count("arms: number of seeds", len(self.seeds))
+        object.__setattr__(self, "conditions", Conditions(**with_tuples(self.conditions)))
+
+
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper compare` with the given arguments; modules: loaded by --task-module.
 
     Raises InputError or OSError: a source, setting or file is invalid.
     """
     path = values_of("--file", args)
-    settings = read_toml(Path(path[0])) if path else {}
-    conditions = Conditions(**settings.get("conditions", {}))
-    cfg: CompareCfg = parse(
-        CompareCfg, "compare", args, default=CompareCfg(primary=settings.get("primary", ""), conditions=conditions)
-    )
+    settings = read_settings(ArmsFile, Path(path[0])) if path else ArmsFile({}, (1,))
+    default = CompareCfg(primary=settings.primary, conditions=settings.conditions)
+    cfg: CompareCfg = parse(CompareCfg, "compare", args, default=default)
     if (cfg.file is None) == (len(cfg.sources) == 0):
         raise UsageError("name what to compare: jumper compare A B, or jumper compare --file FILE.toml")
     sources = cfg.sources
     if cfg.file is not None:
-        modules = [*modules, *(load_task_module(str(cfg.file.parent / name)) for name in settings.get("modules", ()))]
+        modules = [*modules, *(load_task_module(str(cfg.file.parent / name)) for name in settings.modules)]
         sources = train_file(settings)
     from jumper_warp.compare.comparison import compare
     from jumper_warp.compare.report import lines, write_report
 
     comparison = compare(
         *sources, metric=cfg.metric, primary=cfg.primary, evaluate=cfg.evaluate, conditions=cfg.conditions,
-        modules=modules, evaluation=with_tuples(settings.get("evaluation", {})),
-        title=settings.get("title", "Comparison"),
+        modules=modules, evaluation=with_tuples(settings.evaluation), title=settings.title,
     )  # fmt: skip
     print("\n".join(lines(comparison)))
     print(write_report(comparison, cfg.out, html=cfg.html))
 
 
-def train_file(settings: Json) -> list[str]:
-    """Train the arms of a settings file that are not finished, and return them as sources NAME=RUN."""
+def train_file(settings: ArmsFile) -> list[str]:
+    """Train the arms of a settings file that are not finished, and return them as sources NAME=RUN.
+
+    Raises InputError: an arm is invalid.
+    """
     from jumper_warp.cli.train import parse_train
     from jumper_warp.compare.training import train_arm
 
-    common = [*shlex.split(settings.get("flags", "")), "--seeds", *map(str, settings["seeds"])]
-    common += ["--log-root", settings.get("log_root", "logs"), "--no-tensorboard"]
+    def arguments(name: str, task: str, flags: str = "") -> list[str]:
+        seeds = ["--seeds", *map(str, settings.seeds), "--log-root", settings.log_root, "--no-tensorboard"]
+        return [task, *shlex.split(settings.flags), *seeds, *shlex.split(flags), "--run-name", name]
+
     recipes = {}
-    for name, arm in settings["arms"].items():
-        task, flags = (settings["task"], arm) if isinstance(arm, str) else (arm["task"], arm.get("flags", ""))
-        recipes[name] = parse_train([task, *common, *shlex.split(flags), "--run-name", name])[0]
+    for name, arm in settings.arms.items():
+        table = {"task": settings.task, "flags": arm} if isinstance(arm, str) else arm
+        try:
+            args = arguments(name, **table)
+        except (TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"arm {name}: {error}") from error
+        recipes[name] = parse_train(args)[0]
     return [f"{name}={train_arm(recipe)}" for name, recipe in recipes.items()]
 
 
-def read_toml(path: Path) -> Json:
-    """Return the content of a TOML file. Raises InputError: it is missing or malformed."""
+def read_settings(kind: Any, path: Path, **defaults: Any) -> Any:
+    """Return a dataclass with the settings of a TOML file. Raises InputError: they are missing or malformed."""
+    content = read_file(path, "settings")
     try:
-        return tomllib.loads(read_file(path, "settings").decode())
-    except ValueError as error:
+        return kind(**defaults | with_tuples(tomllib.loads(content.decode())))
+    except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: {error}") from error
 
 

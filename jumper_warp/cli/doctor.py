@@ -16,7 +16,7 @@ from jumper_warp.cli.main import FAULT, parse
 TASK = "vertical-jump"  # Task of the environment that is stepped
 WORLDS = 64  # Worlds of the environment
 PACKAGES = (
-    "rerun-sdk", "pin", "onnx", "scipy", "matplotlib", "tyro", "onnxruntime", "cma", "gymnasium", "stable-baselines3",
+    "rerun-sdk", "pin", "onnx", "scipy", "matplotlib", "tyro", "onnxruntime", "gymnasium", "stable-baselines3",
     "usd-core", "newton-usd-schemas", "pyglet", "imageio-ffmpeg", "wandb",
 )  # fmt: skip
 """Packages whose versions are printed, beside those of `jumper_warp.utils.runtime.PACKAGES`."""

@@ -1,4 +1,4 @@
-"""List of the flags that tyro generates from a dataclass, for short help pages, limits and completion."""
+"""List of the flags that tyro generates from a dataclass, for short help pages and limits."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
 FAULT = 1  # Exit code for a fault of the program or the machine
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # Full disk, exhausted quota, too large file
 LEAST_COLUMNS = 20  # Smallest width of a terminal for which the output is laid out
 USAGE_ERROR = 2  # Exit code for input that cannot be used
 INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent with the data
@@ -46,7 +47,6 @@ COMMANDS = {
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
     "doctor": "Check the installation: versions, and a step on each device.",
-    "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules), see MODULES."""
 MODULES = {"bus-sim": "bus_sim", "try": "try_task"}  # Module of `jumper_warp.cli` by command, where their names differ
@@ -230,11 +230,11 @@ def run_command(command: Callable[[], object]) -> None:
         raise SystemExit(USAGE_ERROR) from None
     except OSError as error:
         no_folder = "temporary directory" in str(error)  # of Python's tempfile, which names those that it tried
-        if error.filename is None and error.errno != errno.ENOSPC and not no_folder:
+        if error.filename is None and error.errno not in FULL and not no_folder:
             raise
         if error.filename is None and not no_folder:
             discard_output()
-        place = error.filename or ("TMPDIR" if no_folder else "standard output")
+        place = error.filename or ("TMPDIR" if no_folder else "standard output or an open file")
         print_error(f"{place}: {error.strerror}")
         raise SystemExit(USAGE_ERROR) from None
     except (MemoryError, RuntimeError) as error:

@@ -51,15 +51,16 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     base = cfg.base or (recorded if recorded in TASKS and recorded != task.name else base_of(task))
     result = rescore(recording, task, make_task(base))
     folder = output_dir("rescore", cfg.out)
-    table = Table(
-        Column("sum over an episode", no_wrap=True), base, task.name, "not zero", "smallest", "largest", box=None
-    )
+    names = (Column(name, overflow="fold") for name in (base, task.name))
+    table = Table(Column("sum over an episode", no_wrap=True), *names, "not zero", "least", "most", box=None)
     for row in result.table:
         sums = ("–" if value is None else f"{value:.4g}" for value in (row.base, row.task))
-        table.add_row(row.term, *sums, f"{100.0 * row.nonzero:.0f} %", f"{row.low:.3g}", f"{row.high:.3g}")
+        ends = (f"{end + 0.0:.3g}" for end in (row.low, row.high))  # 0.0 makes 0 of -0
+        table.add_row(row.term, *sums, f"{100.0 * row.nonzero:.0f} %", *ends)
     print_table(table)
     write_metrics(folder, {f"sum_{row.term}": row.task for row in result.table}, {"task": task.name, "base": base})
     result.plot(folder / "rewards.png")
+    print(folder / "rewards.png")
     path = save_recording(result.with_lanes(), folder, cfg.recording.stem)
     print(path)
     open_viewer(path, cfg.viewer)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import ast
+import os
+import signal
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.compare import read_toml, with_tuples
+from jumper_warp.cli.compare import read_settings
 from jumper_warp.cli.main import parse
 from jumper_warp.registry import load_task_module
 from jumper_warp.utils.errors import InputError
@@ -53,8 +56,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         if cfg.workers == 1:
             work_on(cfg.file)
         else:
-            for job in submit(cfg, sweep.folder):
-                job.result()
+            wait_for(submit(cfg, sweep.folder), cancel=cfg.cluster == "local")
     from jumper_warp.compare.sweep_report import write_sweep_report
 
     print(write_sweep_report(sweep))
@@ -67,7 +69,28 @@ def submit(cfg: SweepCfg, folder: Path) -> list:
     executor = submitit.AutoExecutor(folder / "workers", cluster=cfg.cluster)
     pairs = (setting.partition("=")[::2] for setting in cfg.slurm)
     executor.update_parameters(**{"timeout_min": 24 * 60, **{name: number(value) for name, value in pairs}})
-    return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    stderr = os.dup(2)
+    with (folder / "workers" / "controllers.log").open("ab") as log:
+        os.dup2(log.fileno(), 2)  # of submitit's controllers, which print a traceback when they are interrupted
+    try:
+        return executor.map_array(work_on, [cfg.file] * cfg.workers, range(cfg.workers))
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+def wait_for(jobs: Sequence[Any], *, cancel: bool) -> None:
+    """Wait for jobs of submitit; if cancel, Ctrl-C, SIGTERM or SIGHUP ends them, and then this process."""
+    for each in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(each) is signal.SIG_DFL:  # not with nohup
+            signal.signal(each, lambda number, _: sys.exit(128 + number))
+    try:
+        for job in jobs:
+            job.result()
+    except (KeyboardInterrupt, SystemExit):
+        for job in jobs if cancel else ():
+            job.cancel()
+        raise
 
 
 def number(text: str) -> object:
@@ -89,10 +112,7 @@ def read_sweep(file: Path) -> Sweep:
     """Return the settings of a sweep, and load its files of tasks. Raises InputError: they are invalid."""
     from jumper_warp.compare.sweep import Sweep
 
-    try:
-        sweep = Sweep(**{"name": file.stem, **with_tuples(read_toml(file))})
-    except TypeError as error:
-        raise InputError(f"{file}: {error}") from error
+    sweep = read_settings(Sweep, file, name=file.stem)
     for module in sweep.modules:
         load_task_module(str(file.parent / module))
     return sweep

@@ -50,8 +50,6 @@ class SysidCfg:
     the mass of the robot that it records."""
     mass_std: float = 0.02  # [kg] Standard deviation of the scale
     dt: float | None = None  # [s] Largest physics step (default: 1/480)
-    method: Literal["lm", "cma"] = "lm"  # Staged Levenberg-Marquardt over parallel worlds, or CMA-ES
-    max_seconds: float = 60.0  # [s] Time limit of CMA-ES
     noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
     base: Literal["", "free", "fixed"] = ""
     """Whether the base was free or fixed in all motions (default: as their files say)."""
@@ -132,7 +130,7 @@ def sysid(cfg: SysidCfg) -> None:
 
     Exits with code 3 if the fit is not consistent with the data. Raises as `run`.
     """
-    from jumper_warp.identification.identify import identify, identify_by_evolution
+    from jumper_warp.identification.identify import identify
     from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.progress import phase
@@ -151,10 +149,7 @@ def sysid(cfg: SysidCfg) -> None:
 
         motions += [motion for log in logs for motion in motions_of_log(log, cfg.torque_limit or 18.0)]
     configure_device(cfg.device, cfg.threads)
-    if cfg.method == "cma":
-        result = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
-    else:
-        result = identify(motions, parameters, **settings)
+    result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)
     with phase("writing the report"):
         write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")

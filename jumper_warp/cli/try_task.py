@@ -64,7 +64,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     runs = [f"{each.train.run_name}={train_arm(each)}" for each in (recipe, changed)]
     comparison = compare(*runs, evaluate=False, title=f"{task.name} (change) and {base} (base), short trainings")
     print_side_by_side(comparison)
-    plot(comparison, folder / "try.png")
+    plot(comparison, folder / "try.png", verdict=False)
     print(folder / "try.png")
 
 

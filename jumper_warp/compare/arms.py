@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import fnmatch
-import json
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.policies.catalog import CONFIG, find_policy, run_folder
-from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.policies.catalog import CONFIG, find_policy
+from jumper_warp.rl.metrics_file import METRICS_FILE, logged_line
 from jumper_warp.rl.resume import flat_settings
 from jumper_warp.rl.run_folder import SOURCES
 from jumper_warp.rl.run_names import SEED, seed_folders, split_seed, start_time, title
@@ -24,6 +24,7 @@ from jumper_warp.utils.files import Json, read_file, read_json
 OF_A_SEED = ("seed", "seeds", "run-name", "tags")  # Settings in which the runs of an arm may differ
 TERMS = ("Episode_Reward/", "Episode_Sum/")  # Begins of the logged names of reward terms
 TIME = "Perf/elapsed_s"
+STEPS_TO = re.compile(r"steps_to_(\d+)_percent")  # Metric: policy steps until the share that selects checkpoints
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,11 @@ class Member:
     @cached_property
     def config(self) -> Json:
         """Saved configuration of the training. Raises InputError: it is unreadable."""
-        return read_json(self.folder / CONFIG, "settings of a run or policy")
+        path = self.folder / CONFIG
+        config = read_json(path, "settings of a run or policy")
+        if not isinstance(config, dict) or not isinstance(config.get("train"), dict) or "seed" not in config["train"]:
+            raise InputError(f"{path}: no settings of a training")
+        return config
 
     @property
     def seed(self) -> int:
@@ -50,9 +55,13 @@ class Member:
 
     @cached_property
     def log(self) -> list[Json]:
-        """Logged iterations; empty: a policy."""
+        """Logged iterations; empty: a policy. Raises InputError: a line is malformed, other than an unfinished last."""
         path = self.folder / METRICS_FILE
-        return [json.loads(line) for line in read_file(path, "metrics").splitlines()] if path.exists() else []
+        lines = read_file(path, "metrics").split(b"\n")[:-1] if path.exists() else []
+        rows = [logged_line(line) for line in lines]
+        if {} in rows:
+            raise InputError(f"{path} line {rows.index({}) + 1}: malformed")
+        return rows
 
     @property
     def last(self) -> dict[str, float]:
@@ -68,6 +77,12 @@ class Member:
             (steps * line["iteration"], line[TIME], line[metric]) for line in self.log if line.get(metric) is not None
         ]
         return np.array(rows, dtype=float).reshape(-1, 3).T
+
+    def steps_to(self, metric: str, share: float) -> float:
+        """Return the policy steps of all worlds until a metric is at least `share`; all steps if it never is."""
+        steps, _, values = self.curve(metric)
+        reached = steps[values >= share]
+        return float(reached[0] if len(reached) else steps[-1])
 
 
 @dataclass(frozen=True)
@@ -103,7 +118,15 @@ class Arm:
         return {path.name: path.read_text("utf-8") for path in sorted((self.members[0].folder / SOURCES).glob("*.py"))}
 
     def last(self, metric: str) -> np.ndarray:
-        """Return the last logged value of a metric of every seed, (seeds,), without seeds that lack it."""
+        """Return the last logged value of a metric of every seed, (seeds,), without seeds that lack it.
+
+        `steps_to_95_percent`: policy steps of all worlds to 95 % of the metric that selects checkpoints; all steps of a
+        seed that does not reach it.
+        """
+        if share := STEPS_TO.fullmatch(metric):
+            return np.array(
+                [each.steps_to(self.best_metric, 0.01 * int(share[1])) for each in self.members if each.log]
+            )
         return np.array([member.last[metric] for member in self.members if metric in member.last])
 
     def curves(self, metric: str, axis: int, points: int = 100) -> tuple[np.ndarray, np.ndarray]:
@@ -129,6 +152,8 @@ def find_arms(sources: Sequence[str | Path]) -> tuple[Arm, ...]:
     arms: dict[str, dict[tuple[int, str], Member]] = {}
     for source in map(str, sources):
         label, equals, pattern = source.partition("=")
+        if equals and not (label and pattern):
+            raise InputError(f"{source}: expected NAME=SOURCE")
         found = sorted(_folders(pattern if equals else source), key=start_time)
         for folder in found:
             own = folder.parent if folder.name.startswith(SEED) else folder
@@ -166,11 +191,15 @@ def _folders(source: str) -> Iterator[Path]:
         if not runs:
             raise InputError(f"{source}: no such run")
     elif (path / CONFIG).exists() or seed_folders(path) or not path.is_dir():
-        runs = [run_folder(path) if path.suffix == ".pt" else path if seed_folders(path) else find_policy(path)]
+        runs = [path if seed_folders(path) else find_policy(path)]
     else:
         runs = [run for run in path.glob("*/") if (run / CONFIG).exists() or seed_folders(run)]
+    if not runs:
+        raise InputError(f"{source}: no run in this folder")
     for run in runs:
         seeds = seed_folders(run)
+        if seeds and seed is not None and seed not in seeds:
+            raise InputError(f"{run}: no seed {seed}; seeds: {', '.join(map(str, seeds))}")
         yield from [run] if not seeds else seeds.values() if seed is None else [seeds[seed]]
 
 

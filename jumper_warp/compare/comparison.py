@@ -117,9 +117,8 @@ class Comparison:
         """Return a metric of the evaluation, else of the log, of an arm's seeds. Raises InputError: none has it."""
         values = self.evaluated[arm].get(metric, self.arms[arm].last(metric))
         if not len(values):
-            raise InputError(
-                f"{self.arms[arm].name} has no metric {metric}; there are {', '.join(self.evaluated[arm])}"
-            )
+            known = self.evaluated[arm] or self.arms[arm].members[0].last or ["no metrics in it"]
+            raise InputError(f"{self.arms[arm].name} has no metric {metric}; there are {', '.join(known)}")
         return values
 
     def _rows(self, names: Sequence[str], values: Callable[[int, str], np.ndarray]) -> list[Row]:
@@ -163,6 +162,8 @@ def compare(
     if len(arms) < 2:
         names = ", ".join(arm.name for arm in arms)
         raise InputError(f"a comparison needs two arms, got {names}; name them: NAME=RUN OTHER=RUN")
+    if metric and not any(len(arm.last(metric)) for arm in arms):
+        raise InputError(f"no run has logged {metric}; {arms[0].name} has logged {', '.join(arms[0].members[0].last)}")
     conditions = conditions or Conditions()
     configure_device(conditions.device, conditions.threads)
     evaluated: list[Values] = [{} for _ in arms]
@@ -187,7 +188,10 @@ def _evaluate(
         for member in arm.members:
             run = EvaluationRun(member.folder, modules)
             own = test if run.task.state is test.state else run.task
-            flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
+            try:
+                flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
+            except TypeError as error:
+                raise InputError(f"evaluation: {error}") from error
             run.conditions = conditions
             changed = partial(_with_terminations, own)
             log = flags.log(changed(run.task), conditions.stream_seed)

@@ -26,6 +26,7 @@ HEADER = ("metric", "arm", "seeds", "IQM", "95 % interval", "P(better)", "95 % i
 SHOWN = ("Episode_Reward/", "Episode_Sum/", "Episode_Termination/", "Metrics/", "Train/")
 """Begins of the logged names that `print_side_by_side` prints."""
 SENTENCES = {"better": "better than", "worse": "worse than"}  # By `Row.verdict`
+MOST_VERDICTS = 4  # Largest number of arms whose results are above the plots
 STYLE = """body { max-width: 70em; margin: 2em auto; font-family: sans-serif } table { border-collapse: collapse }
 td, th { border: 1px solid #ccc; padding: 0.2em 0.6em } img { max-width: 100% }"""
 
@@ -49,12 +50,15 @@ def write_report(comparison: Comparison, folder: Path | None = None, *, html: bo
     return page
 
 
-def plot(comparison: Comparison, path: Path) -> None:
-    """Plot learning curves over steps and time, the primary metric of every seed, and the last reward terms."""
+def plot(comparison: Comparison, path: Path, *, verdict: bool = True) -> None:
+    """Plot learning curves over steps and time, the primary metric of every seed, and the last reward terms.
+
+    verdict: whether the line above the plots has the results of the tests of up to MOST_VERDICTS arms.
+    """
     arms = [arm.name for arm in comparison.arms]
     terms = len({row.metric for row in comparison.rewards})
     settings: Any = {"figsize": (13, max(9.5, (0.1 * len(arms) + 0.16) * terms)), "title": comparison.title}
-    with figure(path, 3, 2, conditions=subtitle(comparison), **settings) as axes:
+    with figure(path, 3, 2, conditions=subtitle(comparison, verdict=verdict), **settings) as axes:
         for axis, number, label, scale in (
             (axes[0, 0], 0, "policy steps [million]", 1.0e-6),
             (axes[1, 0], 1, "training time [s]", 1.0),
@@ -74,10 +78,17 @@ def plot(comparison: Comparison, path: Path) -> None:
         plot_terms(right, comparison.rewards, arms)
 
 
-def subtitle(comparison: Comparison) -> str:
-    """Return the line below the title: the number of seeds and the meaning of bands."""
+def subtitle(comparison: Comparison, *, verdict: bool) -> str:
+    """Return the line below the title: results of the tests, number of seeds and meaning of bands."""
+    base, *others = comparison.primary
+    words = [f"{row.arm}: {sentence(row, base)}, p = {row.p_value:.2g}" for row in others[:MOST_VERDICTS] if verdict]
     seeds = ", ".join(f"{arm.name} {len(arm.members)}" for arm in comparison.arms)
-    return f"interquartile means with 95 % bootstrap intervals; seeds: {seeds}"
+    return "; ".join([*words, f"interquartile means with 95 % bootstrap intervals; seeds: {seeds}"])
+
+
+def sentence(row: Row, base: Row) -> str:
+    """Return the result of an arm's test in words."""
+    return f"{SENTENCES.get(row.verdict, 'no difference shown from')} {base.arm}"
 
 
 def words(metric: str) -> str:
@@ -163,7 +174,7 @@ def verdicts(comparison: Comparison) -> list[str]:
     """Return a sentence for each arm but the first about the primary metric, and a note if there are few seeds."""
     base, *others = comparison.primary
     lines = [
-        f"**{row.arm}**: {SENTENCES.get(row.verdict, 'no difference shown from')} {base.arm} in `{row.metric}`, "
+        f"**{row.arm}**: {sentence(row, base)} in `{row.metric}`, "
         f"{format_value(row.mean)} and {format_value(base.mean)}; probability of improvement "
         f"{row.improvement:.2f}, p = {row.p_value:.2g}."
         for row in others
@@ -174,6 +185,9 @@ def verdicts(comparison: Comparison) -> list[str]:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         lines.append(f"**Trainings of different lengths**, iterations: {listed}. Logged metrics are those of iteration "
                      f"{min(lengths.values())}.")  # fmt: skip
+    if len({value for row in comparison.primary for value in row.values}) == 1:
+        lines.append(f"**All seeds have the same {comparison.metric}**: train longer, or choose another metric by "
+                     "--primary.")  # fmt: skip
     if comparison.fewest_seeds < FEWEST_SEEDS:
         lines.append(f"**Fewer than {FEWEST_SEEDS} seeds** in an arm: intervals are unreliable, and a test can miss "
                      "any difference.")  # fmt: skip
@@ -185,7 +199,7 @@ def cells(row: Row) -> list[str]:
     improvement = "" if row.improvement is None else f"{row.improvement:.2f}"
     interval = "" if row.improvement_interval is None else "{:.2f} to {:.2f}".format(*row.improvement_interval)
     p = "" if row.p_value is None else f"{row.p_value:.2g}"
-    mean = " to ".join(format_value(end) for end in row.interval) if len(row.values) > 1 else ""
+    mean = " to ".join(f"{end:.3g}" for end in row.interval) if len(row.values) > 1 else ""
     few = "" if len(row.values) >= FEWEST_SEEDS else " (few)"
     return [row.metric, row.arm, f"{len(row.values)}{few}", format_value(row.mean), mean, improvement, interval, p,
             row.verdict]  # fmt: skip
@@ -228,7 +242,7 @@ def lines(comparison: Comparison) -> list[str]:
 
     from jumper_warp.utils.tables import table_lines
 
-    rich = Table("arm", "seeds", comparison.metric, "95 % interval", "P(better)", "p (Holm)", "verdict", box=None)
+    rich = Table("arm", "seeds", comparison.metric, "95 % interval", "P(better)", "p", "verdict", box=None)
     for row in comparison.primary:
         _, arm, seeds, mean, interval, better, _, p, verdict = cells(row)
         rich.add_row(arm, seeds, mean, interval, better, p, verdict)

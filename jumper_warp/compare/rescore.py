@@ -101,16 +101,24 @@ def rescore(recording: Recording | Path | str, task: TaskCfg, base: TaskCfg) -> 
     """
     if not isinstance(recording, Recording):
         recording = load_npz(Path(recording).with_suffix(".npz"))
+    terms, base_terms = (reward_terms(recording, each) for each in (task, base))
+    return Rescored(recording, task.name, base.name, terms, base_terms, running_steps(recording))
+
+
+def running_steps(recording: Recording) -> np.ndarray:
+    """Return whether each recorded episode had not ended before a step, (frames, worlds) bool."""
+    ended = recording.motion[TERMINATION] >= 0
+    return np.cumsum(ended, axis=0) - ended == 0
+
+
+def reward_terms(recording: Recording, task: TaskCfg) -> dict[str, np.ndarray]:
+    """Return the reward terms of a task and their total by name, (frames, worlds); 0 after the end of an episode.
+
+    Raises InputError: the recording has no complete states.
+    """
     if not recording.motion:
         raise InputError("the recording has no complete states; jumper play writes them beside the .rrd file")
-    ended = recording.motion[TERMINATION] >= 0
-    running = np.cumsum(ended, axis=0) - ended == 0
-    terms, base_terms = (_terms(recording, each, running) for each in (task, base))
-    return Rescored(recording, task.name, base.name, terms, base_terms, running)
-
-
-def _terms(recording: Recording, task: TaskCfg, running: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the reward terms of a task and their total by name, (frames, worlds)."""
+    running = running_steps(recording)
     frames, worlds = running.shape
     with phase(f"rewards of {task.name}", frames) as advance:
         env = Env(task, worlds, device="cpu", randomize=False, noise=False, auto_reset=False)

@@ -6,6 +6,7 @@ trial from the last checkpoint.
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import socket
@@ -25,11 +26,12 @@ from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
 from jumper_warp.rl.runner import Observer
 from jumper_warp.rl.training_run import TrainingRun
-from jumper_warp.utils.checks import check_types
+from jumper_warp.utils.checks import NAME, check_count, check_finite, check_not_negative, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
 POLL = 2.0  # [s] Time between two looks at the trials of other workers
+FIXED = ("task", "flags", "seeds", "metric", "direction")  # Settings that all trials of a sweep share
 RUN, ALIVE, WORKER = "run", "alive", "worker"  # Attributes of a trial: name of its run, time of the last sign, process
 
 
@@ -55,9 +57,18 @@ class Sweep:
     modules: tuple[str, ...] = field(default=())  # Files of tasks, relative to the sweep's file
 
     def __post_init__(self) -> None:
-        """Raise InputError: a field is of another type, or there is no parameter."""
+        """Raise InputError: a field is of another type or out of range, or a flag is one that the sweep sets."""
         object.__setattr__(self, "log_root", Path(self.log_root))
         check_types("sweep:", self)
+        check_count("sweep: number of seeds", len(self.seeds))
+        check_count("sweep: trials", self.trials)
+        check_not_negative("sweep: grace", self.grace)
+        if not NAME.fullmatch(self.name):
+            raise InputError(f"sweep: name may contain letters, digits, _ . - and spaces, got {self.name!r:.60}")
+        flags = [*shlex.split(self.flags), *(f"--{name}" for name in self.parameters)]
+        for flag in ("--seeds", "--run-name", "--log-root"):
+            if any(word.partition("=")[0].replace("_", "-") == flag for word in flags):
+                raise InputError(f"the sweep sets {flag}: remove it from flags and parameters")
         if not self.parameters:
             raise InputError("a sweep needs parameters, such as parameters.'ppo.lr' = {low = 1e-4, high = 1e-2}")
 
@@ -79,6 +90,7 @@ class Sweep:
                 kinds[name] = kind(**spec)
             except (TypeError, ValueError, AttributeError) as error:
                 raise InputError(f"parameter {name}: {error}") from error
+            check_finite(f"parameter {name}", *(value for value in spec.values() if isinstance(value, float)))
         return kinds
 
     def arguments(self, params: Json, run: str) -> list[str]:
@@ -89,45 +101,65 @@ class Sweep:
 
 
 def open_study(sweep: Sweep, worker: int = 0) -> Any:
-    """Return the Optuna study of a sweep, which is created if it does not exist; worker: index of this process."""
+    """Return the Optuna study of a sweep, which is created if it does not exist; worker: index of this process.
+
+    Raises InputError: the storage cannot be opened, a setting is out of Optuna's range, or the study has another one of
+    the settings FIXED.
+    """
     import optuna
     from optuna.storages.journal import JournalFileBackend, JournalStorage
+    from sqlalchemy.exc import SQLAlchemyError
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sweep.folder.mkdir(parents=True, exist_ok=True)
     storage: Any = sweep.storage
-    if storage == "sqlite":
-        storage = optuna.storages.RDBStorage(
-            f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
-        )
-    elif storage == "journal":
-        storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
-    pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
-    sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
-    return optuna.create_study(
-        study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
-        sampler=sampler,
-    )  # fmt: skip
+    try:
+        if storage == "sqlite":
+            storage = optuna.storages.RDBStorage(
+                f"sqlite:///{sweep.folder.resolve()}/study.db", engine_kwargs={"connect_args": {"timeout": 60}}
+            )
+        elif storage == "journal":
+            storage = JournalStorage(JournalFileBackend(str(sweep.folder / "journal.log")))
+        pruner = optuna.pruners.MedianPruner(sweep.startup_trials) if sweep.pruning else optuna.pruners.NopPruner()
+        sampler = optuna.samplers.TPESampler(n_startup_trials=sweep.startup_trials, seed=sweep.seed + worker)
+        study = optuna.create_study(
+            study_name=sweep.name, storage=storage, load_if_exists=True, direction=sweep.direction, pruner=pruner,
+            sampler=sampler,
+        )  # fmt: skip
+        for name in FIXED:
+            value = json.loads(json.dumps(getattr(sweep, name)))
+            if (saved := study.user_attrs.get(name, value)) != value:
+                raise InputError(f"sweep {sweep.name}: {name} was {saved!r:.60}, got {value!r:.60}: rename it")
+            study.set_user_attr(name, value)
+        return study
+    except (ImportError, ValueError, SQLAlchemyError) as error:
+        raise InputError(f"sweep {sweep.name}: {error!s:.200}") from error
 
 
 def work(sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe], worker: int = 0) -> None:
     """Run trials until the sweep has `trials` finished or pruned ones, also those of workers that died.
 
-    recipe_of: function of arguments of `jumper train`. worker: index of this process.
+    recipe_of: function of arguments of `jumper train`. worker: index of this process. Raises InputError: the storage
+    fails.
     """
+    from optuna.exceptions import StorageInternalError
     from optuna.trial import TrialState
+    from sqlalchemy.exc import SQLAlchemyError
 
     study = open_study(sweep, worker)
-    while True:
-        requeue_abandoned(study, sweep.grace)
-        states = [trial.state for trial in study.get_trials(deepcopy=False)]
-        done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
-        if done >= sweep.trials:
-            return
-        if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
-            time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
-        else:
-            run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    try:
+        while True:
+            requeue_abandoned(study, sweep.grace)
+            states = [trial.state for trial in study.get_trials(deepcopy=False)]
+            done = states.count(TrialState.COMPLETE) + states.count(TrialState.PRUNED)
+            if done >= sweep.trials:
+                return
+            if done + states.count(TrialState.RUNNING) >= sweep.trials and TrialState.WAITING not in states:
+                time.sleep(POLL)  # the last trials run elsewhere, and may yet be abandoned
+            else:
+                run_trial(study, study.ask(sweep.distributions()), sweep, recipe_of)
+    except (StorageInternalError, SQLAlchemyError) as error:
+        raise InputError(f"storage of sweep {sweep.name}: {error!s:.200}") from error
 
 
 def requeue_abandoned(study: Any, grace: float) -> None:
@@ -197,4 +229,7 @@ def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequenc
         study.tell(trial, state=TrialState.PRUNED)
         return
     logged = [last_metrics(each) for each in seed_folders(folder).values()]
-    study.tell(trial, float(interquartile_mean(np.array([metrics[sweep.metric] for metrics in logged]))))
+    values = [metrics[sweep.metric] for metrics in logged if metrics.get(sweep.metric) is not None]
+    if not values:
+        raise InputError(f"{run} has not logged {sweep.metric} at its end; it logged {', '.join(logged[0])}")
+    study.tell(trial, float(interquartile_mean(np.array(values))))

@@ -71,9 +71,16 @@ def plot_sweep(trials: list[Any], weights: dict[str, float], sweep: Sweep) -> No
                 values = [trial.params[name] for trial in chosen]
                 values = values if all(isinstance(value, int | float) for value in values) else list(map(str, values))
                 results = [trial.value if trial.value is not None else np.nan for trial in chosen]
-                axis.plot(
-                    values, results, style, label=label if chosen else None, color="C0" if style == "o" else "0.5"
-                )
+                color = "C0" if style == "o" else "0.5"
+                axis.plot(values, results, style, label=label if chosen else None, color=color)
             importance = f"importance {weights[name]:.2f}" if name in weights else ""
-            axis.set(xlabel=name, title=importance, xscale="log" if sweep.parameters[name].get("log") else "linear")
+            spec = sweep.parameters[name]
+            axis.set(xlabel=name, title=importance, xscale="log" if spec.get("log") else "linear")
+            if spec.get("log"):
+                ticks = [part * 10.0**power for power in range(-12, 13) for part in (1, 2, 5)]
+                ticks = [tick for tick in ticks if spec["low"] <= tick <= spec["high"]]
+                axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+                axis.minorticks_off()
+            if "low" in spec:
+                axis.set_xlim(spec["low"], spec["high"])
         axes[0, 0].set(ylabel=words(sweep.metric))

@@ -6,16 +6,14 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from jumper_warp.compare.arms import OF_A_SEED, differences
+from jumper_warp.compare.arms import OF_A_SEED, Member, differences
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.resume import FROZEN, find_checkpoints, flat_settings
-from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, newest, seed_folders, title
 from jumper_warp.rl.runner import Observer
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json
 
 
 def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
@@ -28,8 +26,14 @@ def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     run = newest(run for run in runs if any(run.glob(f"*/{CHECKPOINTS}/{MANIFEST}")))
     if run is None:
         return train(recipe, observers=observers).folder
-    folders = [folder for folder in seed_folders(run).values() if not (folder / FROZEN).exists()]
-    saved = flat_settings(read_json(folders[0] / CONFIG, "settings of a run"))
+    seeds = seed_folders(run)
+    if set(seeds) != set(cfg.seeds):
+        trained = ", ".join(map(str, seeds))
+        raise InputError(f"{run} was trained with seeds {trained}: remove it, or choose another log root")
+    folders = [folder for folder in seeds.values() if not (folder / FROZEN).exists()]
+    if not folders:
+        raise InputError(f"{run}: the training of every seed has failed, see {FROZEN} there: remove it")
+    saved = Member(folders[0]).settings
     requested = {name: value for name, value in flat_settings(recipe.to_json()).items() if name not in OF_A_SEED}
     if changed := differences([requested, {name: saved.get(name) for name in requested}]):
         raise InputError(f"{run} was trained with another {next(iter(changed))}: remove it, or choose another log root")

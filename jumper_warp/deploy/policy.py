@@ -215,7 +215,7 @@ def _numbers(name: str, values: Any, width: int) -> np.ndarray:
             if np.ma.is_masked(values):
                 raise TypeError("some values are masked")
             array = np.atleast_1d(np.asarray(values))
-            if array.dtype.kind not in "fiub":
+            if array.dtype.kind not in "fiu":
                 raise TypeError(f"values of type {array.dtype}")
             array = array.astype(np.float32)
     except (TypeError, ValueError, OverflowError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from jumper_warp.envs.arrays import (
     checked_values,
     checked_worlds,
 )
+from jumper_warp.envs.gradients import EnvGradients
 from jumper_warp.envs.stages import Stages, WorldSlice, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
@@ -47,6 +49,8 @@ from jumper_warp.utils.threads import WARP_LOCK, locked
 Values = ArrayLike | torch.Tensor  # Numbers, lists, arrays or tensors
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
+
+STAGES = ("action", "physics", "episode", "observe", "reset")  # of a policy step, in order; see `Env.stages`
 
 
 class Step(NamedTuple):
@@ -155,6 +159,7 @@ class Env(Stages):
         self._graphs = {}
         self.step_hooks: list[Callable[[], None]] = []
         """Functions that `step` calls last, also within a captured graph; they must not change the environment."""
+        self.gradients_of_step: EnvGradients | None = None
         self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
@@ -206,6 +211,7 @@ class Env(Stages):
         self._reset_worlds(self._part(), mask)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
+        self._restart_gradients()
         return self._step.obs, {}
 
     @locked
@@ -252,6 +258,28 @@ class Env(Stages):
         world uses the row of its task. A non-finite action ends the episode as `diverged`.
         Raises InputError (a ValueError): an action of another shape, dtype or device. RuntimeError: not yet reset.
         """
+        return self.step_values(action) if self.gradients_of_step is None else self.gradients_of_step.step(action)
+
+    def gradients(self) -> EnvGradients:
+        """Return a context in which `step` returns rewards and the policy's observations with gradients, as tensors.
+
+        They reach back over the steps of the context to actions and to the state at its beginning, or at the last call
+        of `reset`, `evaluation_reset`, `load_state_dict` or the context's `restart`. Values are the same as without
+        gradients.
+        Raises InputError (a ValueError): several tasks, another solver or moving blocks.
+        """
+        return EnvGradients(self)
+
+    def _restart_gradients(self) -> None:
+        """End the gradients of a context of `gradients` at the current state, which no step has made."""
+        if self.gradients_of_step is not None:
+            self.gradients_of_step.restart()
+
+    def step_values(self, action: torch.Tensor, after_physics: Callable[[], None] | None = None) -> Step:
+        """Advance one policy step without gradients; as `step` outside of `gradients`.
+
+        after_physics: called before rewards and resets; it must not change the environment.
+        """
         if not self._started:
             raise RuntimeError("call reset before the first step")
         several = len(self.skills) > 1
@@ -259,20 +287,32 @@ class Env(Stages):
         (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
         if self.wp_device.is_cuda and torch.cuda.is_current_stream_capturing():
             locked(self._launch_step)()
-        elif (resets := self.auto_reset and self._ends_episodes) not in self._graphs:
-            with WARP_LOCK:
-                self._launch_step()  # loads the modules; counts as this step
-                self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
+        elif after_physics is None:
+            self._replay(STAGES)
         else:
-            self._graphs[resets].replay()
+            self._replay(STAGES[:2])
+            after_physics()
+            self._replay(STAGES[2:])
         for hook in self.step_hooks:
             hook()
         return self._step
 
-    def _launch_step(self, worlds: WorldRange | None = None) -> None:
-        """Launch all stages of a policy step for a range of worlds (default: all)."""
-        for stage in self.stages(worlds).values():
-            stage()
+    def _replay(self, names: Sequence[str]) -> None:
+        """Replay the captured graphs of stages of a policy step; the first call launches and captures them."""
+        kind = (self.auto_reset and self._ends_episodes, *names)
+        if kind in self._graphs:
+            self._graphs[kind].replay()
+            return
+        launch = functools.partial(self._launch_step, names=names)
+        with WARP_LOCK:
+            launch()  # loads the modules; counts as this step
+            self._graphs[kind] = SlicedGraph(launch, self.sim.slices, self.wp_device)
+
+    def _launch_step(self, worlds: WorldRange | None = None, names: Sequence[str] = STAGES) -> None:
+        """Launch stages of a policy step, by default all, for a range of worlds (default: all)."""
+        stages = self.stages(worlds)
+        for name in names:
+            stages[name]()
 
     def _advance_physics(self, part: WorldSlice) -> None:
         """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
@@ -339,6 +379,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
         self.episodes.done.zero_()
+        self._restart_gradients()
 
     @locked
     def command(self, commands: Values, worlds: Values | None = None) -> None:
@@ -494,3 +535,4 @@ class Env(Stages):
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)
+        self._restart_gradients()

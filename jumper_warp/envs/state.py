@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.envs.arrays import FIRST_STEP_COUNT
-from jumper_warp.kernels.mdp.env import RING, Counters, Delays, EpisodeArrays
+from jumper_warp.kernels.mdp.env import Counters, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import records
-from jumper_warp.utils.state_checks import check_tensor, check_values
 from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
@@ -54,8 +51,6 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
     noise, refine or version.
     """
-    if not isinstance(state, dict):
-        raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
     tensors = _tensors(env)
     saved = {prefix: records(array).copy() for prefix, array in _records(env).items()}
     conditions = _conditions(env)
@@ -71,17 +66,17 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     if (saved_envs := len(state["env.done"])) != env.num_envs:
         raise InputError(f"saved with num_envs {saved_envs}, this environment has {env.num_envs}")
     for name, own in conditions.items():
-        check_tensor(state[name], own, f"saved {name}")
         if not torch.equal(state[name], own):
             option = name.partition(".")[2]
             raise InputError(f"saved with {option} {state[name].item()}, this environment has {option} {own.item()}")
-    for name, tensor in tensors.items():
-        check_tensor(state[name], tensor, f"saved {name}")
-    for field, (prefix, name) in fields.items():
-        check_tensor(state[field], torch.from_numpy(saved[prefix][name].copy()), f"saved {field}")
+    expected = tensors | {
+        field: torch.from_numpy(saved[prefix][name].copy()) for field, (prefix, name) in fields.items()
+    }
+    for name, tensor in expected.items():
+        if (state[name].shape, state[name].dtype) != (tensor.shape, tensor.dtype):
+            raise InputError(f"saved {name} has another shape or type")
     for skill in env.skills:
         skill.params.restored(state[f"{skill.task.name}/changed"].numpy())
-    _check_indices(env, state)
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
         raise InputError("saved with other robots: the description or the task's motors differ")
     seed = purpose_seed(env.stream, env.seed)
@@ -94,22 +89,6 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
     env.after_load_state()
-
-
-def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Raise InputError if a saved index (level, skill, step count, latency) is out of bounds."""
-    longest = (RING - 2) * env.sim.substeps  # [physics steps] latency that the ring buffers can hold
-    bounds = {
-        "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
-        "env.skill": (0, len(env.skills) - 1),
-        "env.step_count": (FIRST_STEP_COUNT, math.inf),
-        "parameters.latency": (0, longest),
-        "parameters.observation_latency": (0, longest),
-    }
-    for name, (least, most) in bounds.items():
-        check_values(state[name], f"saved {name}", least)
-        if not bool((state[name] <= most).all()):
-            raise InputError(f"saved {name} must be at most {most}, got {state[name].max().item()}")
 
 
 def _conditions(env: Stages) -> dict[str, torch.Tensor]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import torch
 
     from jumper_warp.envs.env import Env
+    from jumper_warp.envs.gradient_check import GradientCheck
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class AgentCfg:
     randomize: bool = True  # Randomise robots as in training
     seed: int = 0  # Seed of resets, randomisation and actions
     device: str | None = None  # Warp device (default: a GPU if there is one)
+    check_gradients: bool = False
+    """Compare the gradient of each reward with differences, every 10 policy steps."""
     film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
     """Film of the recording to write."""
     out: Path | None = None  # Folder for all results (default: outputs/play/<time>)
@@ -139,6 +142,7 @@ def play_agent(task: TaskCfg, cfg: AgentCfg) -> Path:
     Raises InputError: no such device; OSError: the folder cannot be created.
     """
     from jumper_warp.envs.env import Env
+    from jumper_warp.envs.gradient_check import GradientCheck
     from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
     from jumper_warp.utils.runtime import configure_device
 
@@ -146,7 +150,15 @@ def play_agent(task: TaskCfg, cfg: AgentCfg) -> Path:
     env = Env(task, cfg.num_envs, seed=cfg.seed, device=cfg.device, randomize=cfg.randomize)
     log = AgentLog(task, cfg.num_envs, cfg.seconds)
     recorder = EnvRecorder(env, log, [0], notes={"task": task.name, "policy": f"agent {cfg.agent}"})
-    run_evaluation(actor(cfg.agent, env, cfg.seed), env, log, on_step=recorder)
+    act = actor(cfg.agent, env, cfg.seed)
+    if cfg.check_gradients:
+        env.reset()
+        with env.gradients() as gradients:
+            check = GradientCheck(gradients)
+            run_evaluation(act, env, log, on_step=lambda: (recorder(), check.every(10)))
+        print_gradients(check)
+    else:
+        run_evaluation(act, env, log, on_step=recorder)
     folder = output_dir("play", cfg.out)
     metrics = agent_metrics(log)
     write_metrics(folder, metrics, {"task": task.name, "agent": cfg.agent, "seconds": cfg.seconds, "seed": cfg.seed})
@@ -156,6 +168,21 @@ def play_agent(task: TaskCfg, cfg: AgentCfg) -> Path:
     print(path, *([] if cfg.film.video is None else [cfg.film.write(recording)]), sep="\n")
     open_viewer(path, cfg.viewer)
     return path
+
+
+def print_gradients(check: GradientCheck) -> None:
+    """Print a table of the gradients of the reward terms, and what is wrong with them."""
+    from rich.table import Column, Table
+
+    from jumper_warp.utils.tables import print_table
+
+    table = Table(Column("gradient of the reward", no_wrap=True), "not zero", "at a kink", "fault", box=None)
+    faults = check.faults()
+    kinks = check.kinks()
+    for name, (found, _) in check.results().items():
+        share = 100.0 * (found != 0.0).mean()
+        table.add_row(name, f"{share:.1f} %", f"{100.0 * kinks[name]:.1f} %", faults.get(name, ""))
+    print_table(table)
 
 
 def agent_metrics(log: AgentLog) -> Metrics:
@@ -177,7 +204,7 @@ def print_statistics(log: AgentLog) -> None:
 
     table = Table(Column("reward, per step", no_wrap=True), "smallest", "largest", "mean", "not zero", box=None)
     for name, values in log.rewards.items():
-        numbers = (f"{value:.3g}" for value in (values.min(), values.max(), values.mean()))
+        numbers = (f"{value + 0.0:.3g}" for value in (values.min(), values.max(), values.mean()))
         table.add_row(name, *numbers, f"{100.0 * (values != 0.0).mean():.1f} %")
     print_table(table)
     table = Table(Column(f"termination, of {log.num_ended} episodes", no_wrap=True), "share", box=None)

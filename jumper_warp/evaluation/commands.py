@@ -29,6 +29,7 @@ from jumper_warp.utils.output import Report, write_metrics
 from jumper_warp.utils.summary import PrintFlags
 
 if TYPE_CHECKING:
+    from jumper_warp.evaluation.log import EvaluationLog
     from jumper_warp.evaluation.run import EvaluationRun, Run
     from jumper_warp.viz.recording import Recording
 
@@ -172,31 +173,39 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     `metrics.json` holds the columns of the log, one value per trial.
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
+    live = Live(cfg.seconds or cfg.flags.length) if cfg.viewer == "rerun" else None
+    log, recording = record(run, cfg, live)
+    columns = log.columns()
+    report = write_metrics(run.folder, columns)
+    count = len(next(iter(columns.values())))
+    words = f"{count} {log.row_name}{'s' * (count > 1)}"
+    keys = log.main_columns or columns
+    return show_recording(run, report, recording, log.row_name, cfg, words, keys, live)
+
+
+def record(run: EvaluationRun, cfg: PlayCfg, live: Live | None = None) -> tuple[EvaluationLog, Recording]:
+    """Simulate a policy, and return the log and the recording of all its robots; live: viewer that shows them.
+
+    Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
+    """
     from jumper_warp.evaluation.log import run_evaluation
     from jumper_warp.evaluation.recorder import EnvRecorder
     from jumper_warp.evaluation.trained import warn_beyond_resets, warn_beyond_training
 
-    flags = cfg.flags
-    name = run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
-    log = flags.log(run.evaluation.prepare_task(run.task))
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task))
     warn_beyond_training(run.task, log.all_commands())
     env = run.env(log.count, rewards=cfg.rewards)
-    worlds = range(log.count)
+    name = run.policy.interface.task
     notes = {"policy": played_name(run.source), "task": name, "solver": cfg.conditions.solver, **cfg.film.notes}
-    seconds = cfg.seconds or flags.length
-    live = Live(seconds) if cfg.viewer == "rerun" else None
-    recorder = EnvRecorder(env, log, worlds, notes=notes, live=live and live.recording)
+    recorder = EnvRecorder(env, log, range(log.count), notes=notes, live=live and live.recording)
+    seconds = cfg.seconds or cfg.flags.length
     stop = cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=stop)
     columns = log.columns()
     if any(key.startswith("command_") for key in columns):
         warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})
-    report = write_metrics(run.folder, columns)
-    count = len(next(iter(columns.values())))
-    words = f"{count} {log.row_name}{'s' * (count > 1)}"
-    keys = log.main_columns or columns
-    return show_recording(run, report, recorder.recording(), log.row_name, cfg, words, keys, live)
+    return log, recorder.recording()
 
 
 def played_name(source: str | Path) -> str:

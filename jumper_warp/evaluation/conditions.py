@@ -16,7 +16,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import TaskError
-from jumper_warp.utils.checks import check_flag_fields, check_seed, check_type
+from jumper_warp.utils.checks import check_flags, check_seed, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
@@ -54,7 +54,7 @@ class Conditions:
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
         object.__setattr__(self, "seed", check_seed(self.seed))
-        check_flag_fields(self)
+        check_flags(randomize=self.randomize, noise=self.noise, push_in_flight=self.push_in_flight)
         check_type("latency", self.latency, float | None)
         check_type("gain_scale", self.gain_scale, Sequence[float] | None)
         check_type("sensor_offset", self.sensor_offset, float | None)

@@ -222,7 +222,7 @@ def finetune(
     """Fine-tune a policy; return the new policy, and a dictionary of the settings and of the errors in each step.
 
     Its keys: `settings`, `aims` (errors of `correct_aim`), `steps` (records of `tune_weights`).
-    modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
+    modules: the user's task modules; log: prints a line of progress. Raises InputError as `Env.gradients` and
     `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """
     begin = time.perf_counter()

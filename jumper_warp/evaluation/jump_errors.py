@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
+from jumper_warp.envs.gradients import EnvGradients, LoopState, origin_velocity
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME, updated_apex
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 from jumper_warp.utils.progress import phase
@@ -45,18 +45,17 @@ class JumpGroup:
     std: float  # [m] Standard deviation that weights the errors
     commands: np.ndarray  # (n, 4) Commands of `jump_commands`
     to_height: bool  # Whether the error is that of the apex height, else of the landing position
-    loop: ClosedLoop = field(init=False)  # Differentiable steps of the same robots
+    gradients: EnvGradients = field(init=False)  # Of the environment's steps
 
     def __post_init__(self) -> None:
         """Save the environment's state, from which every run of the jumps begins with the same robots."""
         self._initial_state = self.env.state_dict()
-        self.loop = ClosedLoop(self.env)
+        self.gradients = self.env.gradients()
 
     def begin(self) -> None:
         """Reset all robots to their state when the group was made, and command their jumps."""
         self.env.load_state_dict(self._initial_state)
         self.env.evaluation_reset(self.commands)
-        self.loop.read_parameters()
 
     def importance(self, errors: JumpErrors) -> torch.Tensor:
         """Return the weights (m,) that the errors of the jumps have in the cost that fine-tuning reduces.
@@ -67,26 +66,25 @@ class JumpGroup:
         return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
 
-def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
+def ballistic_landing(gradients: EnvGradients, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
     """Return x and y [m] of the landing points of ballistic flights from the jumps' apexes, (n,) each, differentiable.
 
     World frame; the base lands at LANDING_HEIGHT. states: of every policy step; steps: indices of the apexes in them,
     (n,).
     """
-    motions = [loop.motion(state) for state in states]
-    pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
     worlds = torch.arange(len(steps), device=steps.device)
-    pos, vel = pos[steps, worlds], vel[steps, worlds]
-    g = loop.task.gravity
-    drop = (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)
-    fall_time = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * drop).sqrt()) / g
-    return [pos[:, i] + fall_time * vel[:, i] for i in range(2)]
+    q, qd = (torch.stack([getattr(state, name) for state in states])[steps, :, worlds].T for name in ("q", "qd"))
+    pos, vel = q[:3], origin_velocity(q, qd, gradients.com)
+    g = gradients.task.gravity
+    drop = (pos[2] - LANDING_HEIGHT).clamp(min=0.0)
+    fall_time = (vel[2] + (vel[2].square() + 2.0 * g * drop).sqrt()) / g
+    return [pos[i] + fall_time * vel[i] for i in range(2)]
 
 
 def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
     """Simulate the jumps of a group under a network's actions, and return their errors; derivatives: with Jacobian."""
     env = group.env
-    loop = group.loop
+    gradients = group.gradients
     to_height = group.to_height
     group.begin()
     begin = int(group.commands[:, 3].min())
@@ -94,24 +92,22 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
     with torch.no_grad():
         for _ in range(begin):
             env.step(network.act(env.obs))
-    state = loop.state()
     states = []
     tape = Tape()
+    obs = env.obs
     arrays: dict[str, np.ndarray] = {}
     apex = np.full(len(group.commands), np.nan)
     apex_step = np.zeros(len(group.commands), dtype=np.int64)
-    with phase(f"simulating {len(group.commands)} {group.name} jumps", last - begin) as advance:
-        for _ in range(begin, last):
+    name = f"{len(group.commands)} {group.name} jumps"
+    with phase(f"simulating {name}", last - begin) as advance, gradients if derivatives else torch.no_grad():
+        for step in range(last - begin):
+            obs = env.step(network.act(obs, tape=tape if derivatives else None)).obs["actor"]
             if derivatives:
-                state, _ = loop.step(state, network.act(loop.observation(state), tape=tape))
-            else:
-                env.step(network.act(env.obs))
-                state = loop.state()
-            states.append(state)
+                states.append(gradients.state)
             arrays = env.task_arrays()
             earlier = apex
             apex = updated_apex(earlier, arrays)
-            apex_step[apex != earlier] = len(states) - 1
+            apex_step[apex != earlier] = step
             if ((arrays["phase"] == LANDED) | (apex - arrays["base_pos"][:, 2] > DESCENT)).all():
                 break
             advance()
@@ -120,13 +116,13 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
         errors = [apex - group.commands[:, 2]]
     else:
         errors = _landing_errors(env, network)
-    value = torch.as_tensor(np.concatenate(errors), dtype=loop.dtype, device=env.device)
+    value = torch.as_tensor(np.concatenate(errors), dtype=torch.float32, device=env.device)
     valid = valid.repeat(len(errors)) & value.isfinite()
     jacobian = value.new_zeros(0)
     if derivatives:
         steps = torch.as_tensor(apex_step, device=env.device)
         heights = torch.stack([state.q[2] for state in states]).gather(0, steps[None])
-        outcomes = [heights[0]] if to_height else ballistic_landing(loop, states, steps)
+        outcomes = [heights[0]] if to_height else ballistic_landing(gradients, states, steps)
         rows = [per_world_gradients(outcome.sum(), tape) for outcome in outcomes]
         jacobian = torch.cat(rows).nan_to_num(0.0, 0.0, 0.0)
     return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome, random_headings
+from jumper_warp.evaluation.jumps import DELAY, JumpLog, JumpOutcome, random_headings
 from jumper_warp.evaluation.log import check, within
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
@@ -162,6 +162,7 @@ class LandingFlags(JumpFlags):
     goal_y: tuple[float, float] = PlaceEvaluation.goal_y
     """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
     heading: Literal["any"] | float = "any"  # [deg] Heading of all robots, or any: sampled from the full circle
+    delay: float = DELAY  # [s] Time until the jump is commanded; 0 for policies that always observe their goal
 
     def __post_init__(self) -> None:
         """Raise InputError for goals [m] out of range or a heading that is not finite, and as `JumpFlags`."""
@@ -169,6 +170,7 @@ class LandingFlags(JumpFlags):
         for name in ("goal_x", "goal_y"):
             low, high = getattr(self, name)
             check(-10.0 < low <= high < 10.0, f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
+        check(0.0 <= self.delay <= 10.0, f"delay must be in [0, 10] s, got {self.delay}")
         if self.heading != "any":
             check_finite("heading", self.heading)
 
@@ -177,7 +179,7 @@ class LandingFlags(JumpFlags):
         rng = np.random.default_rng(seed)
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return JumpLog(goals[:, None], task.termination_names, headings)
+        return JumpLog(goals[:, None], task.termination_names, headings, self.delay)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -91,8 +91,6 @@ class Suite(EvaluationArgs, ABC):
 class Sweep(Suite):
     """Base class of suites with one jump to each of evenly spaced goals, which flags of `jumper evaluate` define."""
 
-    pushed: ClassVar[tuple[str, ...]]  # Keys of the metrics that are also measured with pushes in flight
-
     @property
     @abstractmethod
     def flags(self) -> HeightFlags | LandingFlags:
@@ -104,20 +102,6 @@ class Sweep(Suite):
         log.rest = self.rest_time
         return run.run_episodes(env, log, film=film)
 
-    def pushed_in_flight(self, run: EvaluationRun) -> Metrics:
-        """Repeat the sweep with robots that are pushed in flight, and return its metrics as `pushed_in_flight_<key>`.
-
-        Empty for nominal robots, and if the test itself pushes in flight.
-        """
-        if not self.randomize or self.push_in_flight:
-            return {}
-        env = run.env(self.num_jumps, conditions=replace(run.conditions, push_in_flight=True))
-        values = self.flags.metrics(self.run_sweep(run, env))
-        pushed = {
-            key: values[key]._replace(over=f"{values[key].over} of robots pushed in flight") for key in self.pushed
-        }
-        return {f"pushed_in_flight_{key}": value for key, value in pushed.items()}
-
 
 @dataclass(frozen=True)
 class HeightSweep(Sweep):
@@ -126,8 +110,8 @@ class HeightSweep(Sweep):
     Every robot stands in the default pose and is commanded to jump after half a second. A jump reaches its height if
     the largest base height is within 0.1 m of the commanded height. It succeeds if it also starts on command, no other
     part than the paws touches anything, and the base is at rest a second after touchdown. A fall or a collision ends a
-    jump, whose apex until then is evaluated. Randomised robots are pushed while a paw is down; a second test pushes
-    them in flight too. The open-loop jump of each robot (squat, hold, full extension) gives the height it can reach.
+    jump, whose apex until then is evaluated. Randomised robots are pushed while a paw is down. The open-loop jump of
+    each robot (squat, hold, full extension) gives the height it can reach.
     """
 
     policy: str = "vertical_jump"
@@ -139,8 +123,6 @@ class HeightSweep(Sweep):
     paper: ClassVar = HeightEvaluation.published
     summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
                          "open_loop_apex_mean_m")  # fmt: skip
-    pushed: ClassVar = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
-                        "miss_rate", "apex_error_abs_mean_m")  # fmt: skip
     least: ClassVar = 3
 
     def __post_init__(self) -> None:
@@ -175,7 +157,7 @@ class HeightSweep(Sweep):
         )
         inside = within(jumps.goals[..., 2], self.flags.success_range)
         values = limit_metrics(jumps.outcome, jumps.goals[..., 2], limit[:, None], inside)
-        return self.flags.metrics(jumps) | values | self.pushed_in_flight(run)
+        return self.flags.metrics(jumps) | values
 
 
 @dataclass(frozen=True)
@@ -186,7 +168,7 @@ class DistanceSweep(Sweep):
     half a second. A jump reaches its goal if the base is within 0.1 m of it in the plane a second after touchdown. It
     succeeds if it also starts on command, no other part than the paws touches anything, and the base is at rest. Paws
     lifted again, second hops and second takeoffs (upward at 0.25 m/s with no paw down) are reported separately.
-    Randomised robots are pushed while a paw is down; a second test pushes them in flight too.
+    Randomised robots are pushed while a paw is down.
     """
 
     distance_range: tuple[float, float] = (0.3, 1.5)  # [m] Distance of the nearest and of the farthest goal
@@ -196,8 +178,6 @@ class DistanceSweep(Sweep):
     name: ClassVar = "range"
     paper: ClassVar = PlaceEvaluation.published
     summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
-    pushed: ClassVar = ("success_rate", "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate",
-                        "landing_tilt_max_deg", "goal_distance_at_rest_mean_m")  # fmt: skip
     least: ClassVar = 3
 
     def __post_init__(self) -> None:
@@ -230,4 +210,4 @@ class DistanceSweep(Sweep):
             title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )
-        return self.flags.metrics(landings) | self.pushed_in_flight(run)
+        return self.flags.metrics(landings)

@@ -20,10 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from scipy.optimize import least_squares
 
-from jumper_warp.identification.motions import csv_rows
+from jumper_warp.identification.motions import cell_number, csv_rows
 from jumper_warp.identification.uncertainty import mismatch_factor
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
+from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
@@ -60,9 +61,10 @@ class Bench:
 
     def __post_init__(self) -> None:
         """Raise InputError for unequal columns, below 10 rows, NaN, falling times, or speeds above 300 rad/s."""
-        n = len(self.time)
+        n = np.size(self.time)
         for name in COLUMNS:
-            values = getattr(self, name)
+            values = real_array(getattr(self, name), f"bench: {name}", np.float64)
+            object.__setattr__(self, name, values)
             if values.shape != (n,) or n < 10:
                 raise InputError(f"bench: {name} must be one column of at least 10 rows, got shape {values.shape}")
             if not np.isfinite(values).all():
@@ -84,7 +86,7 @@ def load_bench(path: Path) -> Bench:
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing; expected {', '.join(COLUMNS)}")
     try:
-        table = np.array([[float(row[names.index(name)]) for name in COLUMNS] for row in rows[1:]])
+        table = np.array([[cell_number(row[names.index(name)]) for name in COLUMNS] for row in rows[1:]])
     except (ValueError, IndexError):
         raise InputError(f"{path}: every row must hold {len(names)} numbers") from None
     try:

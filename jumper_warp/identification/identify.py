@@ -9,7 +9,6 @@ is confirmed by a second start, and the residuals are tested (`consistency`).
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -40,12 +39,10 @@ from jumper_warp.identification.results import (
     summarise,
 )
 from jumper_warp.robot.description import RobotDescription
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.progress import phase
 
 COARSE_DT = 1.0 / 480.0  # [s] lower bound of the physics step in all stages but the last one
-POPULATION = 128  # candidates in a generation of CMA-ES
-FIRST_STD = 0.3  # initial step size of CMA-ES, in standard deviations of the priors
 PIECES_DECREASE, STAGE_DECREASE = 0.1, 0.02
 """[1] Relative decrease of the cost below which the stage on pieces, and the stages on whole motions, end."""
 CONVERGED = 0.5
@@ -80,6 +77,9 @@ def identify(
     motions that identify no parameter.
     """
     check_distinct(motions)
+    check_type("parameters", parameters, ParameterSet)
+    check_type("noise", noise, NoiseLevels | None)
+    check_type("dt", dt, float | None)
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
         replay = MotionReplay(description=description, device=device, threads=threads)
@@ -96,56 +96,6 @@ def identify(
         descent = Descent(replay, advance)
         problem, minima = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
     return summarise(problem, minima, descent.steps, descent.effort)
-
-
-def identify_by_evolution(
-    motions: Sequence[RecordedMotion],
-    parameters: ParameterSet,
-    *,
-    noise: NoiseLevels | None = None,
-    prior_measurements: Sequence[PriorMeasurement] = (),
-    dt: float | None = None,
-    max_seconds: float = 60.0,
-    population: int = POPULATION,
-    seed: int = 0,
-    device: wp.DeviceLike = None,
-    threads: int | None = None,
-) -> Identification:
-    """Identify the robot's parameters from recorded motions by CMA-ES, an evolution strategy.
-
-    Initial states stay at their first measurement. max_seconds [s]: wall time of the search. population: candidates in
-    a generation. Other arguments as in `identify`. Raises InputError: as `identify`, or `cma` is not installed.
-    """
-    try:
-        import cma
-    except ImportError:
-        raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
-    check_distinct(motions)
-    if not max_seconds > 0.0 or population < 4:
-        raise InputError("evolution needs a time above 0 s and a population of at least 4")
-    replay = MotionReplay(device=device, threads=threads)
-    whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
-    problem = LeastSquares(parameters, whole, replay, prior_measurements)
-    point = problem.nominal_point()
-    descent = Descent(replay)
-    low, high = parameters.bounds()
-    options = {"popsize": population, "seed": seed + 1, "verbose": -9, "bounds": [low, high]}
-    search = cma.CMAEvolutionStrategy(point.z, FIRST_STD, options)
-    starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
-    best, cost = point.z, np.inf
-    with phase("identifying parameters by CMA-ES", math.ceil(max_seconds)) as advance:
-        while (seconds := descent.effort().seconds) < max_seconds and not search.stop():
-            candidates = np.array(search.ask())
-            costs = problem.costs(candidates, starts)
-            search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
-            if costs.min() < cost:
-                best = candidates[int(np.argmin(costs))]
-                cost = float(costs.min())
-            effort = descent.effort()
-            descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
-            advance(effort.seconds - seconds)
-    point = Point(np.clip(best, low, high), point.starts)
-    return summarise(problem, [Minimum(point, problem.normal(point))], descent.steps, descent.effort)
 
 
 class Descent:

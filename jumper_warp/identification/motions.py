@@ -17,8 +17,8 @@ from typing import Any, Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS
-from jumper_warp.utils.arrays import read_npz, write_npz
-from jumper_warp.utils.checks import check_bounds
+from jumper_warp.utils.arrays import read_npz, real_array, write_npz
+from jumper_warp.utils.checks import check_bounds, check_number, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import existing_file, parse_json, read_file, read_json
 
@@ -30,7 +30,7 @@ MAX_CSV_BYTES = 64 * 2**20  # Size of the largest CSV file that is read
 MAX_ROWS, MAX_COLUMNS = 1_000_000, 200  # Largest table of a motion, more than an hour at 240 Hz
 DEGREES = math.pi / 180.0
 UNITS = {
-    "time": {"s": 1.0, "ms": 1.0e-3},
+    "time": {"s": 1.0, "ms": 1.0e-3, "us": 1.0e-6, "ns": 1.0e-9},
     "target": {"rad": 1.0, "deg": DEGREES},
     "angle": {"rad": 1.0, "deg": DEGREES},
     "rate": {"rad/s": 1.0, "deg/s": DEGREES},
@@ -94,13 +94,18 @@ class RecordedMotion:
 
     def __post_init__(self) -> None:
         """Raise InputError for a measured channel of wrong shape, not finite or out of range, or an invalid setting."""
-        n = len(self.time)
         where = f"motion {self.name}"
+        for name in ("time", *PER_MOTOR, "position", "quaternion"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, real_array(getattr(self, name), f"{where}: {name}", np.float64))
+        n = self.time.size
         if not 3 <= n <= MAX_ROWS or self.time.ndim != 1:
             raise InputError(f"{where}: time must be one column of 3 to {MAX_ROWS} rows, got shape {self.time.shape}")
         if not np.isfinite(self.time).all() or not (np.diff(self.time) > 0.0).all():
             row = int(np.argmin(np.concatenate([[1.0], np.nan_to_num(np.diff(self.time), nan=-1.0)]) > 0.0))
             raise InputError(f"{where}: time must be finite and rise, it does not in row {row}")
+        if (step := float(np.median(np.diff(self.time)))) > 1.0:
+            raise InputError(f"{where}: time rises by {step:.4g} s a row: give its unit, such as [ms]")
         for name, width in (*((name, 12) for name in PER_MOTOR), ("position", 3), ("quaternion", 4)):
             values = getattr(self, name)
             if values is None:
@@ -125,10 +130,8 @@ class RecordedMotion:
                 raise InputError(f"{where}: quaternions must have length 1")
         if all(getattr(self, name) is None for name in CHANNELS):
             raise InputError(f"{where}: nothing is measured; expected one of {', '.join(CHANNELS)}")
-        if self.base not in ("free", "fixed") or self.gains not in ("jumping", "walking"):
-            raise InputError(f"{where}: base must be free or fixed and gains jumping or walking")
-        if isinstance(self.torque_limit, bool) or not 0.1 <= self.torque_limit <= 1000.0:
-            raise InputError(f"{where}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
+        check_types(where, self)
+        check_number(f"{where}: torque_limit", self.torque_limit, 0.1, 1000.0, "N m")
 
     @property
     def duration(self) -> float:
@@ -261,20 +264,18 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         if len(row) != len(names):
             raise InputError(f"{path} line {number}: expected {len(names)} values, found {len(row)}")
         try:
-            columns.append([float(cell) if cell.strip() else math.nan for cell in row])
-        except ValueError:
-            raise InputError(f"{path} line {number}: expected numbers, found {first_non_number(row)!r:.40}") from None
+            columns.append([cell_number(cell) for cell in row])
+        except ValueError as error:
+            raise InputError(f"{path} line {number}: {error}") from None
     return channels_of(path, names, np.array(columns)), sidecar_settings(path)
 
 
-def first_non_number(row: list[str]) -> str:
-    """Return the first cell of a CSV row that is neither a number nor empty; "" if there is none."""
-    for cell in row:
-        try:
-            float(cell or "nan")
-        except ValueError:
-            return cell
-    return ""
+def cell_number(cell: str) -> float:
+    """Return the number in a cell of a CSV file, NaN if it is empty. Raises ValueError: no number, such as 1_0."""
+    try:
+        return float(cell.replace("_", "x")) if cell.strip() else math.nan
+    except ValueError:
+        raise ValueError(f"expected numbers, found {cell!r:.40}") from None
 
 
 def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -299,10 +300,22 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (pyarrow.ArrowException, OSError) as error:
         raise InputError(f"{path}: not a Parquet file ({error!s:.200})") from None
     try:
-        columns = [column.to_numpy(zero_copy_only=False).astype(np.float64) for column in table.columns]
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: all columns must hold numbers") from None
+        columns = [_column(name, table[name].to_numpy(zero_copy_only=False)) for name in table.column_names]
+    except (TypeError, ValueError, KeyError):
+        raise InputError(f"{path}: all columns must hold numbers, and have names of their own") from None
     return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), sidecar_settings(path)
+
+
+def _column(name: str, values: np.ndarray) -> np.ndarray:
+    """Return a column of a Parquet file as float64; points in time or durations in `time` as seconds since the first.
+
+    Raises TypeError: it has other values than numbers.
+    """
+    if values.dtype.kind in "mM" and name in ("time", "time [s]"):
+        return (values - values[:1]) / np.timedelta64(1, "s")
+    if values.dtype.kind not in "fiu" and any(value is not None for value in values):
+        raise TypeError(name)
+    return values.astype(np.float64)
 
 
 def sidecar_settings(path: Path) -> dict[str, Any]:

@@ -37,7 +37,7 @@ LARGEST_PRIOR_ERROR = 3.0
 class DescentStep:
     """Log entry of one optimisation step: cost, damping and effort so far."""
 
-    stage: int  # number of the stage, from 1; 0: CMA-ES
+    stage: int  # number of the stage, from 1
     chi2: float  # [1] Cost over the number of measured values
     damping: float  # [1] Levenberg-Marquardt damping of the step; infinite if no step lowered the cost
     world_steps: int  # physics steps of all worlds so far

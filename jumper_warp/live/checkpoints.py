@@ -18,6 +18,7 @@ from jumper_warp.recipe import Recipe
 from jumper_warp.rl.checkpoint import latest_checkpoint, newest_name
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import CHECKPOINTS
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import parse_json
 
 WORLDS = 16  # Number of simulated robots
@@ -31,7 +32,7 @@ def watch_checkpoints(
 
     Worlds have curriculum levels of the checkpoint's worlds. modules: the user's task modules. seconds: time after
     which to end (default: with the viewer's process).
-    Raises CheckpointError or TaskError: the run has no usable checkpoint.
+    Raises CheckpointError or TaskError: the run has no usable checkpoint. InputError: the viewer's process failed.
     """
     path, state, _, _ = latest_checkpoint(run / CHECKPOINTS)
     recipe = Recipe.from_json(parse_json(state["config"], "config"), list(modules) or None)
@@ -59,4 +60,5 @@ def watch_checkpoints(
             feed.put(Steps(0, buffer.number, state["iteration"], words))
         time.sleep(max(0.0, begin + steps * env.step_dt - time.monotonic()))
     feed.close()
-    feed.process.wait()
+    if status := feed.process.wait():
+        raise InputError(f"the viewer's process ended with status {status}")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.metrics_file import METRICS_FILE, logged_line
 
 GROUPS = {
     "Train/mean_reward": "reward", "Metrics/": "metrics", "Episode_Termination/": "terminations",
@@ -26,7 +25,7 @@ class MetricsTail:
         self._read = 0
 
     def lines(self) -> list[dict[str, Any]]:
-        """Return the complete lines since the last call."""
+        """Return the complete lines since the last call, without malformed ones."""
         if not self._path.is_file():
             return []
         with self._path.open("rb") as file:
@@ -34,7 +33,7 @@ class MetricsTail:
             content = file.read()
         end = content.rfind(b"\n") + 1
         self._read += end
-        return [json.loads(line) for line in content[:end].splitlines()]
+        return [metrics for line in content[:end].splitlines() if (metrics := logged_line(line))]
 
 
 def curves_of(lines: Sequence[dict[str, Any]], label: str = "") -> dict[tuple[str, str], list[tuple[float, float]]]:

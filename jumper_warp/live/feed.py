@@ -134,9 +134,9 @@ def live_address(run: Path) -> tuple[str, str] | None:
     """Return the addresses that `write_address` wrote last into a run's folder, or one within, if a server answers."""
     files = [file for pattern in (ADDRESS, f"*/{ADDRESS}", f"*/*/{ADDRESS}") for file in run.glob(pattern)]
     for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
-        url, page = file.read_text().splitlines()
-        if is_served(url):
-            return url, page
+        lines = file.read_text(errors="replace").splitlines()
+        if len(lines) == 2 and is_served(lines[0]):
+            return lines[0], lines[1]
     return None
 
 

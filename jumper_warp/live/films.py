@@ -24,7 +24,7 @@ FOLDER = "videos"  # in a run's folder; TensorBoard shows it as a run of its own
 LENGTH = 300  # [policy steps] of the longest film
 SIZE = (480, 270)  # [px]
 FPS = 15.0  # [1/s]
-EYE = (3.6, -1.8, 1.6)  # [m] camera, from the robots' mean position
+EYE = (4.8, -2.0, 2.0)  # [m] camera, from the robots' mean position
 SPACING = 1.2  # [m] Distance between robots
 
 

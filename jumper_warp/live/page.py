@@ -129,9 +129,9 @@ class Page:
     def show(self) -> None:
         """Show the robot and its goal; the viewer's origin follows the robot over the ground."""
         session = self.session
-        self.scene.update(session.poses)
         x, y = session.position[:2]
         self.scene.follow(np.array([x, y, float(session.surface(np.array([x]), np.array([y]))[0])]))
+        self.scene.update(session.poses)
         goal = None if session.jump is None else session.jump.goal
         if goal is not self.shown_goal:
             self.shown_goal = goal

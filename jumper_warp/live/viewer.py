@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from threading import Thread
 from typing import Any, BinaryIO
 
@@ -125,7 +125,10 @@ def read_messages(source: BinaryIO, inbox: deque[Steps | None]) -> None:
 def main() -> None:
     """Show what the standard input brings, until it ends."""
     source = sys.stdin.buffer
-    setup = Setup.read(source)
+    try:
+        setup = Setup.read(source)
+    except EOFError:  # the sender has ended
+        return
     single = len(setup.folders) == 1
     runs = setup.titles[:SHOWN_RUNS]
     names = [role if single else f"{run}: {role}" for run in runs for role in ROLES]
@@ -133,7 +136,8 @@ def main() -> None:
     with ExitStack() as cleanup:
         if setup.viewer != "none":
             view, url, page = open_view(setup, names, cleanup)
-            write_address(setup.folders, url, page)
+            with suppress(OSError):  # a full disk: the view can be opened, but not joined
+                write_address(setup.folders, url, page)
             announce(url, page)
         run(Show(setup, view), source, 8.0 if view is None else view.rate)
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from jumper_warp.live.curves import curves_of
 from jumper_warp.live.scene import RobotScene
-from jumper_warp.viz.style import SERIES_COLORS
+from jumper_warp.viz.style import SERIES_COLORS, css
 from jumper_warp.viz.viser import ROOT, ViserScene, open_server
 
 PORT = 8081  # the next free one is used if it is taken
 ABOVE = np.array([0.0, 0.0, 0.3])  # [m] from a robot's base to its name
 EYE = (3.2, -1.0, 1.9)  # [m] camera of a new visitor
-COLORS = [f"rgb({','.join(str(round(255 * part)) for part in color)})" for color in SERIES_COLORS]
+COLORS = [css(color) for color in SERIES_COLORS]
 
 
 class ViserView:

@@ -106,7 +106,7 @@ def newest_run(source: str | Path) -> str | Path:
 def _no_policy(text: str, path: Path) -> str:
     """Return the error message for a name or path that is no policy: the task's policies, or similar names."""
     if path.is_file():
-        return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
+        return f"{path} is a file; give the folder of a policy or of a training run"
     if len(path.parts) > 1 or path.suffix:
         return f"{path}: no such folder (policy)"
     tasks = policy_tasks()
@@ -128,6 +128,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     Pictures may be missing. Raises PolicyError: another file is missing, one is truncated or altered, or the manifest
     is malformed or of another version.
     """
+    folder = Path(folder)
     path = folder / MANIFEST
     while True:
         data = read_file(path, PURPOSE, error=PolicyError)
@@ -187,6 +188,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
     Raises PolicyError: the folder is not an intact policy. OSError as `write_files`.
     """
+    folder = Path(folder)
     with directory_lock(folder.resolve().parent):
         write_files(folder, files, read_files(folder))
 
@@ -246,6 +248,7 @@ def summarise(folder: Path) -> PolicySummary:
 
     Raises PolicyError: it is no policy, or a file is missing, altered or malformed.
     """
+    folder = Path(folder)
     try:
         files = read_files(folder)
         interface = PolicyInterface.from_json(parse_object(folder / CONFIG, files[CONFIG])["interface"])

@@ -423,6 +423,8 @@ def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
     fraction: 0 gives `policy`; 1 acts like `other` wherever neither policy clips its normalised observation.
     Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].
     """
+    check_type("policy", policy, Policy)
+    check_type("other", other, Policy)
     if not 0.0 <= fraction <= 1.0:
         raise PolicyError(f"the fraction of a blend must be from 0 to 1, got {fraction}")
     if policy.interface != other.interface:

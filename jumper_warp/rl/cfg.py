@@ -13,7 +13,6 @@ from jumper_warp.utils.checks import (
     NAME,
     check_bounds,
     check_count,
-    check_flag_fields,
     check_not_negative,
     check_seed,
     check_types,
@@ -100,11 +99,8 @@ class PpoCfg:
         object.__setattr__(self, "hidden", tuple(self.hidden) if isinstance(self.hidden, list) else self.hidden)
         check_types("ppo", self)
         check_bounds("ppo", self, PPO_BOUNDS)
-        check_flag_fields(self)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
-        if self.symmetry not in ("off", "actor"):
-            raise InputError(f"symmetry must be off or actor, got {self.symmetry!r:.40}")
         if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
             widths = f"1 to {MAX_HIDDEN} widths of 1 to {MAX_WIDTH}"
             raise InputError(f"hidden must name {widths}, got {self.hidden!s:.60}")
@@ -186,7 +182,6 @@ class TrainCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
-        check_flag_fields(self)
         check_types("training:", self)
         object.__setattr__(self, "num_envs", check_count("num_envs", self.num_envs))
         for name in ("max_iterations", "log_interval", "save_interval", "max_checkpoints"):
@@ -201,8 +196,6 @@ class TrainCfg:
             if name is not None and not NAME.fullmatch(name):
                 allowed = "letters, digits, _ . - and spaces"
                 raise InputError(f"task, run_name and tags may contain {allowed}, got {name!r:.60}")
-        if self.trainer not in ("ppo", "rsl-rl"):
-            raise InputError(f"trainer must be ppo or rsl-rl, got {self.trainer!r:.40}")
         for name in ("resume", "init_policy"):
             if getattr(self, name) == "":
                 raise InputError(f"{name} is empty: pass None to begin without it")

@@ -18,8 +18,6 @@ from jumper_warp.utils.files import Json, existing_file, read_file, read_json, w
 
 PURPOSE = "checkpoint of a training"
 MAX_BYTES = 8 * 2**30  # Size of the largest checkpoint that is read
-REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
-"""Required keys of a checkpoint, and the types of their values."""
 DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError)
 """Exceptions raised on reading a part of a checkpoint that is missing or of another type."""
 
@@ -32,7 +30,7 @@ class Checkpoint(NamedTuple):
     """Loaded training checkpoint: its path and contents, and the reasons why newer ones cannot be used."""
 
     path: Path
-    state: Json  # contents, with at least the keys of REQUIRED
+    state: Json  # contents, see `save_checkpoint`
     skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
     newest: str  # file name of the newest checkpoint in the folder when this one was loaded
 
@@ -40,9 +38,9 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_checkpoints: int = 3) -> Path:
     """Save a training's state as the file `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
 
-    folder: created if missing. state: tensors, numbers and strings, with at least the keys of REQUIRED. score: higher
-    is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest checkpoints
-    to keep, at least 1.
+    folder: created if missing. state: tensors, numbers and strings, with the keys iteration, ppo, env, rng and config.
+    score: higher is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest
+    checkpoints to keep, at least 1.
     Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,25 +69,16 @@ def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_c
 def load_checkpoint(path: Path) -> Json:
     """Return the training state in a checkpoint file of this package, with all tensors on the CPU.
 
-    Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint; or its iteration
-    differs from the manifest.
+    Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint.
     """
-    existing_file(path, PURPOSE, MAX_BYTES, CheckpointError)
+    path = existing_file(path, PURPOSE, MAX_BYTES, CheckpointError)
     entry = _read_manifest(path.parent).get(path.name)
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
     data = read_file(path, PURPOSE, MAX_BYTES, CheckpointError)
     if hashlib.sha256(data).hexdigest() not in (entry["sha256"], entry.get("updating")):
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
-    state = _decoded(path, data)
-    if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:
-        raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
-    for key, expected in REQUIRED.items():
-        if type(state[key]) is not expected:
-            raise CheckpointError(f"{path}: {key} must be {expected.__name__}, got {type(state[key]).__name__}")
-    if state["iteration"] != entry["iteration"]:
-        raise CheckpointError(f"{path}: its iteration is {state['iteration']}, in {MANIFEST} {entry['iteration']}")
-    return state
+    return _decoded(path, data)
 
 
 def load_foreign_checkpoint(path: Path) -> Any:
@@ -115,6 +104,7 @@ def one_line_message(error: Exception) -> str:
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
     """Load and return the most recently saved usable checkpoint of a folder. Raises CheckpointError: there is none."""
+    folder = Path(folder)
     manifest = _read_manifest(folder)
     skipped: list[str] = []
     for name in reversed(manifest):
@@ -145,6 +135,7 @@ def best_checkpoint(folder: Path) -> Path:
 
     Raises CheckpointError: there is none.
     """
+    folder = Path(folder)
     return folder / (_best(_read_manifest(folder)) or newest_name(folder))
 
 
@@ -181,14 +172,6 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, Json]:
     if missing_ok and not path.exists():
         return {}
     manifest = read_json(path, "checksums of checkpoints", error=CheckpointError, finite=False)  # scores may be NaN
-    if not isinstance(manifest, dict) or not all(_is_entry(entry) for entry in manifest.values()):
+    if not isinstance(manifest, dict):
         raise CheckpointError(f"{path}: not readable")
     return manifest
-
-
-def _is_entry(entry: Any) -> bool:
-    """Return whether a checkpoint's manifest entry has SHA-256, iteration and score, each of the right type."""
-    if not isinstance(entry, dict) or not {"sha256", "iteration", "score"} <= entry.keys():
-        return False
-    valid_score = type(entry["score"]) in (int, float, type(None))
-    return isinstance(entry["sha256"], str) and type(entry["iteration"]) is int and valid_score

@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, existing_file, parse_json, read_file, write_atomically
 
 METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object per logged iteration
@@ -23,7 +24,7 @@ class MetricsFile:
         """
         content = existing_file(path, "metrics of a run", sys.maxsize).read_bytes() if path.exists() else b""
         lines = content.splitlines()
-        kept = [line for line in lines if _iteration_of(line) <= iteration]
+        kept = [line for line in lines if logged_line(line).get("iteration", math.inf) <= iteration]
         self.path = path
         self.dropped = len(lines) - len(kept)  # Number of removed lines
         valid_content = b"".join(line + b"\n" for line in kept)
@@ -66,17 +67,17 @@ class MetricsFile:
         self._file.close()
 
 
-def last_metrics(run: Path) -> Json:
-    """Return the last line that a training logged, as a dict; empty: there is none, or it is malformed."""
-    with suppress(ValueError, IndexError, OSError):
-        line = parse_json(read_file(run / METRICS_FILE, "metrics of a run").splitlines()[-1], METRICS_FILE)
-        return line if isinstance(line, dict) else {}
+def logged_line(line: bytes) -> Json:
+    """Return the metrics in a line of a metrics file by name, None for undefined ones; empty: it is malformed."""
+    with suppress(InputError):
+        metrics = parse_json(line, METRICS_FILE)
+        if isinstance(metrics, dict) and isinstance(metrics.get("iteration"), int):
+            return metrics if all(isinstance(value, int | float | None) for value in metrics.values()) else {}
     return {}
 
 
-def _iteration_of(line: bytes) -> float:
-    """Return the iteration number in a line of a metrics file; infinity for a malformed line."""
-    try:
-        return int(json.loads(line)["iteration"])
-    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-        return math.inf
+def last_metrics(run: Path) -> Json:
+    """Return the last line that a training logged, as a dict; empty: there is none, or it is malformed."""
+    with suppress(ValueError, IndexError, OSError):
+        return logged_line(read_file(run / METRICS_FILE, "metrics of a run").splitlines()[-1])
+    return {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,6 @@ from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, SEED, newest, seed_f
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.sources import changed_sources
-from jumper_warp.utils.state_checks import check_parts, check_tensor
 
 if TYPE_CHECKING:
     from jumper_warp.rl.cfg import TrainCfg
@@ -95,18 +93,12 @@ def check_unchanged(checkpoint: Checkpoint) -> None:
 def rank_state(state: Json, rank: Rank) -> Json:
     """Return the state that one process (rank) restores from a checkpoint, with the entries `env`, `rng` and `ppo`.
 
-    Raises InputError: another number of processes saved the checkpoint, or a part is missing.
+    Raises InputError: another number of processes saved the checkpoint.
     """
-    others = state.get("others")
-    if not isinstance(others, list):
-        raise InputError(f"others must be a list, got {type(others).__name__}")
-    if 1 + len(others) != rank.size:
-        raise InputError(f"saved by {1 + len(others)} processes, resumed by {rank.size}")
-    if rank.index == 0:
-        return state
-    local = others[rank.index - 1]
-    check_parts(local, ("ppo", "env", "rng"), f"others.{rank.index - 1}")
-    return local
+    ranks = [state, *state["others"]]
+    if len(ranks) != rank.size:
+        raise InputError(f"saved by {len(ranks)} processes, resumed by {rank.size}")
+    return ranks[rank.index]
 
 
 def saved_init_policy(state: Json) -> str | None:
@@ -178,14 +170,6 @@ def _flat(value: Any, name: str = "") -> Json:
     return {key: leaf for part in parts for key, leaf in part.items()}
 
 
-def saved_seconds(state: Json) -> float:
-    """Return the training time [s] saved in a checkpoint, 0 if it has none. Raises InputError: it is malformed."""
-    seconds = state.get("seconds", 0.0)
-    if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
-        raise InputError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
-    return float(seconds)
-
-
 def random_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Return the states of a learner's random generator and of torch's default ones, `cpu` and `cuda`.
 
@@ -201,22 +185,11 @@ def set_random_state(state: dict[str, torch.Tensor], generator: torch.Generator)
     """Set a learner's random generator, and torch's default ones, to states from `random_state`.
 
     Checkpoints of earlier versions lack the learner's, which then was torch's default one of its device. States of
-    another kind of device are not used. Raises InputError: a part is missing or not a generator's state.
+    another kind of device are not used.
     """
-    current = random_state(generator)
-    if not isinstance(state, dict) or "cpu" not in state:
-        raise InputError("rng lacks cpu")
     kind = generator.device.type
-    parts = {"cpu": (state["cpu"], torch.default_generator)}
-    if "cuda" in current.keys() & state.keys():
-        parts["cuda"] = (state["cuda"], torch.cuda.default_generators[torch.cuda.current_device()])
+    torch.set_rng_state(state["cpu"])
+    if "cuda" in state and torch.cuda.is_available():
+        torch.cuda.set_rng_state(state["cuda"])
     if (learner := state.get(f"learner_{kind}", state.get(kind))) is not None:
-        parts[f"learner_{kind}"] = (learner, generator)
-    for name, (part, _) in parts.items():
-        check_tensor(part, current[name], f"rng.{name}")
-    try:
-        for part, each in parts.values():
-            each.set_state(part)
-    except RuntimeError as error:
-        torch.set_rng_state(current["cpu"])
-        raise InputError(f"rng is not the state of a generator: {error}") from error
+        generator.set_state(learner)

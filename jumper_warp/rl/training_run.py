@@ -111,7 +111,7 @@ class TrainingRun:
             local = resume.rank_state(state, self.rank)
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
-            self.clock.seconds = resume.saved_seconds(state)
+            self.clock.seconds = float(state.get("seconds", 0.0))
             resume.set_random_state(local["rng"], self.ppo.generator)
         except DECODE_ERRORS as error:
             suffix = f" ({', '.join(lines)})" if lines else ""

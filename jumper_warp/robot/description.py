@@ -36,6 +36,7 @@ def load_description(path: Path = DEFAULT_DESCRIPTION) -> RobotDescription:
 
     Each is read once. Their values are not checked here; tests check the project's files.
     """
+    path = Path(path)
     table = json.loads(path.read_text(encoding="utf-8"))
     urdf = UrdfReader(path.parent / table["urdf"])
     types = {name: motor_type(name, constants) for name, constants in table["motor_types"].items()}

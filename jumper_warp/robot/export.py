@@ -13,6 +13,7 @@ from jumper_warp.robot.parts import mesh_files
 from jumper_warp.robot.urdf_writer import loop_closures, urdf
 from jumper_warp.robot.usd import write_usd
 from jumper_warp.robot.values import RobotValues, described
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.files import write_atomically
 
 RobotFormat = Literal["mjcf", "urdf", "usd"]
@@ -31,8 +32,10 @@ def export_robot(
     """Export the robot as MJCF, URDF or USD, with the files that belong to it, and return the main file's path.
 
     Existing files are replaced. overlay: values that replace those of the description, by default the project's.
-    Raises InputError: USD without the package `usd-core`; OSError: the folder cannot be written.
+    Raises InputError: another format, USD without the package `usd-core`; OSError: the folder cannot be written.
     """
+    check_type("kind", kind, RobotFormat)
+    folder = Path(folder)
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if overlay is None else overlay.robots(description)
     robot = described(values, description)

@@ -175,6 +175,7 @@ class LimitsCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError unless the limits are finite, lower < upper, and their hard zones do not overlap."""
+        check_types("angle", self)
         check_angle_limits("angle", **vars(self))
 
 
@@ -193,6 +194,7 @@ class FilterCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if horizon or speed floor is out of its range."""
+        check_types("filter", self)
         check_filter_speed(self.horizon, self.speed_floor)
 
 

@@ -15,19 +15,10 @@ from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
 from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, paw_contacts_kernel
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.motors import MOTOR_CONSTANTS
-from jumper_warp.sim.dynamics import (
-    MAX_SWEEPS,
-    TOLERANCE,
-    JumperDynamics,
-    WorldRange,
-    check_step,
-    check_worlds,
-    warn_of_colliders,
-)
-from jumper_warp.utils.checks import check_type
+from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, check_step, warn_of_colliders
+from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.checks import check_finite, check_type
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import KernelStruct
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
 
@@ -122,32 +113,32 @@ class SolverJumper(SolverBase):
         """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
-        self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
-
-    @locked
-    def step_motors(
-        self, state_in: State, state_out: State, motors: KernelStruct, target: wp.array, dt: float, substeps: int, *,
-        control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
-        bodies: bool = True, observables: SolverBase.Observables | None = None, worlds: WorldRange | None = None,
-        contacts: newton.Contacts | None = None,
-    ) -> None:  # fmt: skip
-        """Advance every world by `substeps` steps of dt [s] in one launch, with motors that follow targets.
-
-        motors: `MotorArrays`, as `jumper_warp.robot.motors.motor_arrays` returns them. target: motor angles [rad],
-        (12, num_worlds), constant during the call; with delay [physics steps], (num_worlds,), the motors follow
-        `previous` (12, num_worlds) until the target arrives. control: additional joint forces, constant. bodies:
-        whether to write passive joints, loop joints and bodies, which the solver does not read. observables: mean
-        accelerations over the whole call, and contacts of the last step, as in `step`. worlds: range to advance, by
-        default all. `state_out` may be `state_in`.
-
-        Raises InputError: dt is not finite and positive, substeps no whole number of at least 1, arrays of another
-        shape or device, a range beyond the worlds, or as `update_contacts`.
-        """
-        self.validate_observables(observables, contacts)
-        self._check_motors(motors, target=target, previous=previous, delay=delay)
-        check_worlds(worlds, self.model.world_count)
-        drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
-        self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
+        check_step(dt, 1)
+        if state_out is not state_in:
+            self._check_state("state_out", state_out)
+        qdd = state_out.body_qdd
+        contact_f = None
+        if observables is not None:
+            qdd = qdd if observables.body_qdd is None else observables.body_qdd
+            contact_f = observables.contact_f
+        if qdd is not None:
+            self._check("body_qdd", qdd, self._state_shapes["body_qd"])
+            wp.copy(self._old_body_qd, state_in.body_qd)
+        if state_out.joint_q.requires_grad:
+            raise InputError("SolverJumper has no gradients on Warp's tape; use jumper_warp.diff.rollout.Rollout")
+        out = (state_out.joint_q, state_out.joint_qd)
+        self.dynamics.advance(dt, 1, drive, state_in.joint_q, state_in.joint_qd, *out)
+        self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd)
+        if qdd is not None:
+            wp.launch(
+                body_acceleration_kernel,
+                dim=self.model.body_count,
+                inputs=[self._old_body_qd, state_out.body_qd, dt],
+                outputs=[qdd],
+                device=self.model.device,
+            )
+        if observables is not None and contact_f is not None and observables.contacts is not None:
+            self._write_contacts(observables.contacts, state_out, contact_f)
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces of a control and the body wrenches of a state, or zeros where they are None."""
@@ -172,53 +163,6 @@ class SolverJumper(SolverBase):
         """Raise InputError unless the arrays of a state are those of a state of this model; name: for the message."""
         for field, shape in self._state_shapes.items():
             self._check(f"{name}.{field}", getattr(state, field, None), shape)
-
-    def _check_motors(self, motors: KernelStruct, **arrays: wp.array | None) -> None:
-        """Raise InputError unless the given constants of motors, targets and delay fit the number of worlds."""
-        n = self.model.world_count
-        for name in MOTOR_CONSTANTS:
-            self._check(f"motors.{name}", getattr(motors, name, None), (12, n))
-        for name, array in arrays.items():
-            if array is not None:
-                self._check(name, array, (n,) if name == "delay" else (12, n))
-
-    def _advance(
-        self, state_in: State, state_out: State, drive: KernelStruct, dt: float, substeps: int,
-        observables: SolverBase.Observables | None, bodies: bool, worlds: WorldRange | None = None,
-    ) -> None:  # fmt: skip
-        """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`.
-
-        Accelerations of bodies are changes of their velocities over the whole call, divided by its time.
-        """
-        substeps = check_step(dt, substeps)
-        if state_out is not state_in:
-            self._check_state("state_out", state_out)
-        qdd = state_out.body_qdd
-        contact_f = None
-        if observables is not None:
-            qdd = qdd if observables.body_qdd is None else observables.body_qdd
-            contact_f = observables.contact_f
-        if qdd is not None:
-            self._check("body_qdd", qdd, self._state_shapes["body_qd"])
-            wp.copy(self._old_body_qd, state_in.body_qd)
-        coordinates = (state_in.joint_q, state_in.joint_qd)
-        out = (state_out.joint_q, state_out.joint_qd)
-        if state_out.joint_q.requires_grad:
-            raise InputError("SolverJumper has no gradients on Warp's tape; use jumper_warp.diff.rollout.Rollout")
-        self.dynamics.advance(dt, substeps, drive, *coordinates, *out, worlds)
-        if bodies or qdd is not None or contact_f is not None:
-            self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
-        if qdd is not None:
-            wp.launch(
-                body_acceleration_kernel,
-                dim=self.model.body_count,
-                inputs=[self._old_body_qd, state_out.body_qd, dt * substeps],
-                outputs=[qdd],
-                device=self.model.device,
-            )
-
-        if observables is not None and contact_f is not None and observables.contacts is not None:
-            self._write_contacts(observables.contacts, state_out, contact_f)
 
     @locked
     def update_contacts(self, contacts: newton.Contacts, state: State | None = None) -> None:
@@ -276,8 +220,11 @@ class SolverJumper(SolverBase):
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Move the sliding blocks of some worlds (indices), by default all, to new start positions, at rest.
 
-        center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks.
+        center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks, or
+        unless they are finite numbers.
         """
+        center = real_array(center, "center")
+        check_finite("center", *center.ravel())
         values = self._block_values()
         values["start"][slice(None) if worlds is None else list(worlds)] = center
         self._blocks().assign(values)

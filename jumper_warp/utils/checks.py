@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
@@ -103,12 +103,6 @@ def check_flags(**flags: Any) -> None:
             raise InputError(f"{name} must be True or False, got {value!r:.40}")
 
 
-def check_flag_fields(cfg: Any) -> None:
-    """Raise InputError unless all fields of a dataclass whose default is a bool have one; see `check_flags`."""
-    names = [spec.name for spec in dataclasses.fields(cfg) if isinstance(spec.default, bool)]
-    check_flags(**{name: getattr(cfg, name) for name in names})
-
-
 def check_types(section: str, cfg: Any) -> None:
     """Raise InputError for a field of a dataclass, or of one that it contains, whose type is not the annotated one.
 
@@ -154,6 +148,8 @@ def _fits(value: Any, hint: Any) -> bool:
     parts = get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str | int) and value in parts
     if origin is tuple:
         if isinstance(value, tuple) and parts[-1:] == (Ellipsis,):
             return all(_fits(part, parts[0]) for part in value)
@@ -170,8 +166,8 @@ def _shown(hint: Any) -> str:
     """Return an annotated type as text for error messages, such as `(float, float)` or `(RewardTerm, ...)`."""
     origin = get_origin(hint)
     parts = get_args(hint)
-    if origin in (Union, UnionType):
-        return " or ".join(map(_shown, parts))
+    if origin in (Union, UnionType, Literal):
+        return " or ".join(part if isinstance(part, str) else _shown(part) for part in parts)
     if origin is tuple:
         return f"({', '.join(map(_shown, parts))})"
     if origin is Sequence:

@@ -47,6 +47,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises OSError: the disk is full, the folder cannot be written, or the path is a device or a folder; its `filename`
     is the path.
     """
+    path = Path(path)
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "not a regular file", str(path))
     part = path.with_name(path.name + ".part")

@@ -6,16 +6,20 @@ import atexit
 import gc
 import io
 import os
+import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
-from threading import RLock
+from threading import RLock, current_thread, main_thread
 from types import ModuleType
 from typing import Any
 
 DEFERRED = frozenset(f"newton.{name}" for name in ("actuators", "controllers", "ik", "selection", "sensors", "viewer"))
 """Modules that `import newton` imports and few commands need; `newton.viewer` imports the Rerun SDK."""
+UNINTERRUPTED = "trimesh"  # Module that catches all exceptions of its imports, also KeyboardInterrupt
 COLLECTION_THRESHOLD = 50_000
 """Surplus of allocated objects that starts a garbage collection after the first one."""
 FIRST_COLLECTION_THRESHOLD = 1_200_000
@@ -64,14 +68,31 @@ class DeferredLoader(Loader):
 
 
 class DeferredFinder(MetaPathFinder):
-    """Import finder that defers the code of the modules in `DEFERRED` to their first use, which saves their time."""
+    """Import finder that defers the code of `DEFERRED` to its first use, and Ctrl-C to the end of `UNINTERRUPTED`."""
 
     def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Return the specification of a deferred module, None for any other module."""
-        spec = PathFinder.find_spec(fullname, path, target) if fullname in DEFERRED else None
-        if spec is not None and spec.loader is not None:
+        spec = PathFinder.find_spec(fullname, path, target) if fullname in {*DEFERRED, UNINTERRUPTED} else None
+        if spec is not None and spec.loader is not None and fullname in DEFERRED:
             spec.loader = DeferredLoader(spec.loader)
+        elif spec is not None and spec.loader is not None:
+            spec.loader.exec_module = partial(_uninterrupted, spec.loader.exec_module)
         return spec
+
+
+def _uninterrupted(execute: Callable[[ModuleType], None], module: ModuleType) -> None:
+    """Run a module's code; Ctrl-C is handled at its end."""
+    if current_thread() is not main_thread():
+        execute(module)
+        return
+    requests = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: requests.append(number))
+    try:
+        execute(module)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    for number in requests:
+        signal.raise_signal(number)
 
 
 class LossyFile(io.FileIO):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.checks import check_count, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
@@ -64,12 +64,16 @@ def write_film(
     """
     check_type("recording", recording, Recording)
     path = Path(path)
-    size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    width, height = (pixels + pixels % 2 for pixels in size)
+    size = (width, height)
     check_film(path, size, fps, speed, eye)
+    View(np.array([1.0, 0.0, 0.0]), np.zeros(3), field_of_view).axes()
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
+    check_type("ranks", ranks, Sequence[int])
+    check_count("number of ranks", len(ranks))
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
     images = _images(recording, times, size, eye, field_of_view, ranks, path.name)
@@ -87,7 +91,8 @@ def write_film(
 
 def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye: Sequence[float] | None = None) -> None:
     """Raise InputError unless a film can be written with these arguments of `write_film`."""
-    check_type("size", size, Sequence[int])
+    path = Path(path)
+    check_type("size", tuple(size) if isinstance(size, Sequence) else size, tuple[int, int])
     check_type("fps", fps, float)
     check_type("speed", speed, float)
     if path.suffix not in SUFFIXES:

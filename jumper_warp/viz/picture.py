@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.checks import check_flags, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.progress import phase
@@ -230,10 +230,12 @@ def write_picture(
     """
     check_type("recording", recording, Recording)
     path = Path(path)
+    check_type("width", width, int)
+    check_type("title", title, str | None)
+    check_flags(true_scale=true_scale)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
         raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")
-    if not 1.0 <= field_of_view <= 120.0:
-        raise InputError(f"the angle of view must be in 1 to 120 deg, got {field_of_view:g}")
+    View(np.array([1.0, 0.0, 0.0]) if eye is None else np.asarray(eye), np.zeros(3), field_of_view).axes()
     scene = compose(recording, rank, eye, true_scale)
     direction = scene.toward_eye + [0.0, 0.0, ELEVATION] if eye is None else np.array(eye, dtype=float)
     view, size = _framed(_extent(scene), direction, width, field_of_view)
@@ -283,7 +285,8 @@ def _extent(scene: Composition) -> np.ndarray:
     goals = scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.stays else np.zeros((0, 3))
     boxes = corners(scene.bases, ground)
     if scene.stays:
-        goals = np.array([scene.point(along, ground - 0.1, IN_FRONT) for along in (low, high)])  # labels of the axis
+        ends = (low + 0.1 - 0.08 * (high - low), high)  # the label of the axis is left of `low`
+        goals = np.array([scene.point(along, ground - 0.1, IN_FRONT) for along in ends])
     return np.concatenate(
         [boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]]
     )

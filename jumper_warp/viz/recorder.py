@@ -162,7 +162,12 @@ class Recorder:
         if not self._times[first:]:
             raise InputError("the recording has no frames")
         marks: Any = {"goals": goals, "heights": heights, "commands": self._commands[first:] or None}
-        marks = {name: np.asarray(values, np.float32) for name, values in marks.items() if values is not None}
+        marks = {name: real_array(values, name) for name, values in marks.items() if values is not None}
+        for name, dimensions in (("goals", 3), ("heights", 1)):
+            shape = np.shape(marks.get(name, ()))
+            fits = len(shape) == dimensions and shape[0] in (0, len(self._worlds)) and shape[2:] in ((), (3,))
+            if name in marks and not fits:
+                raise InputError(f"{name} must have one row for each of {len(self._worlds)} worlds, got shape {shape}")
         series = np.stack(self._series[first:], axis=1)
         return Recording(
             times=np.array(self._times[first:]),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.arrays import read_npz, write_npz
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.viz.shapes import SURFACE, ShapeMesh, packed_shapes, unpacked_shapes
@@ -86,7 +87,10 @@ class Recording:
         return self.poses[:, self.body_indices(rank)]
 
     def body_indices(self, rank: int) -> list[int]:
-        """Return the indices in `bodies` of the bodies of the rank-th recorded world."""
+        """Return the indices in `bodies` of a world's bodies by its rank. Raises InputError: no such rank."""
+        check_type("rank", rank, int)
+        if not 0 <= rank < len(self.worlds):
+            raise InputError(f"rank must be in 0 to {len(self.worlds) - 1}, got {rank}")
         prefix = f"world_{self.worlds[rank]}/"
         return [i for i, body in enumerate(self.bodies) if body.startswith(prefix)]
 

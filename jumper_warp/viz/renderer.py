@@ -17,6 +17,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from jumper_warp.utils.checks import check_number
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model, State
 from jumper_warp.viz.shapes import ShapeMesh
@@ -45,8 +46,11 @@ class View:
     def axes(self) -> np.ndarray:
         """Return the unit vectors right, up and ahead of the image as rows, (3, 3), world frame.
 
-        Raises InputError: eye and target are on one vertical line.
+        Raises InputError: eye and target are on one vertical line, or the eye is no point, or the angle out of range.
         """
+        check_number("field_of_view", self.field_of_view, 1.0, 120.0, "deg")
+        if np.shape(self.eye) != (3,) or not np.isfinite(self.eye).all():
+            raise InputError(f"eye must be three finite coordinates, got {self.eye!s:.60}")
         ahead = np.asarray(self.target, dtype=float) - np.asarray(self.eye, dtype=float)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):

@@ -65,7 +65,7 @@ def is_served(url: str) -> bool:
     """Return whether a server listens at the address of `RerunServer.url`."""
     try:
         create_connection((LOOPBACK, int(port_of(url))), 1.0).close()
-    except OSError:
+    except (OSError, IndexError, ValueError, OverflowError):  # no server, or no such address
         return False
     return True
 

@@ -17,3 +17,8 @@ SERIES_COLORS = (
     *LEG_COLORS.values(), (0.337, 0.706, 0.914), COMMAND_COLOR, (0.941, 0.894, 0.259), (0.5, 0.5, 0.5), BASE_COLOR,
 )  # fmt: skip
 """Colors of many series, in order."""
+
+
+def css(color: tuple[float, float, float]) -> str:
+    """Return a color as CSS."""
+    return f"rgb({','.join(str(round(255 * part)) for part in color)})"

@@ -59,18 +59,21 @@ class ViserScene:
         self.links = {}
         for body in sorted({shape.body for shape in shapes} - {-1}):
             glb = glb_of([shape for shape in shapes if shape.body == body])
-            self.links[body] = scene.add_batched_glb(f"{ROOT}/link_{body}", glb, quaternions, places, lod="off")
+            self.links[body] = scene.add_batched_glb(f"/link_{body}", glb, quaternions, places, lod="off")
 
     def update(self, poses: np.ndarray) -> None:
-        """Place all robots; poses: (robots, links, 7), position [m] and quaternion xyzw, world frame."""
+        """Place all robots; poses: (robots, links, 7), position [m] and quaternion xyzw, world frame.
+
+        Relative to the followed point and not below ROOT, which a slow browser moves later than the links.
+        """
         by_link = np.moveaxis(poses, 1, 0).astype(np.float32)
         quaternions = np.roll(by_link[..., 3:], 1, axis=2)
         for body, link in self.links.items():
-            link.batched_positions = by_link[body, :, :3]
+            link.batched_positions = (by_link[body, :, :3] - self.center).astype(np.float32)
             link.batched_wxyzs = quaternions[body]
 
     def follow(self, point: np.ndarray) -> None:
-        """Move the viewer's origin to a point [m], (3,), world frame."""
+        """Move the viewer's origin to a point [m], (3,), world frame, for the next `update`."""
         self.center = np.asarray(point, dtype=float)
         self.root.position = -self.center
         if self.ground is not None and self.endless:

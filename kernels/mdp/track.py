@@ -17,9 +17,17 @@ from .view import RobotArrays, base_pos, base_quat, base_velocity
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
+@wp.struct
+class PawMotion:
+    """Motion of a paw's centre, world axes."""
+
+    pos: wp.vec3  # [m]
+    vel: wp.vec3  # [m/s]
+
+
 @wp.func
-def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
-    """Write position [m] and velocity [m/s] of a leg's paw centre (`paw_pos`, `paw_vel`), world axes."""
+def paw_motion(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int) -> PawMotion:
+    """Return the motion of a leg's paw from the coordinates and rates of base and joints."""
     quat = base_quat(arrays, world)
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
     rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
@@ -28,14 +36,23 @@ def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg
     i = leg_dof(world, 0) - 3
     ang = wp.vec3(arrays.joint_qd[i], arrays.joint_qd[i + 1], arrays.joint_qd[i + 2])
     along = wp.quat_rotate(quat, paw.jacobian * rates)
-    arrays.paw_pos[leg, world] = base_pos(arrays, world) + arm
-    arrays.paw_vel[leg, world] = base_velocity(arrays, world, quat) + wp.cross(ang, arm) + along
+    motion = PawMotion()
+    motion.pos = base_pos(arrays, world) + arm
+    motion.vel = base_velocity(arrays, world, quat) + wp.cross(ang, arm) + along
+    return motion
 
 
 @wp.func
-def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
-    """Return the height of a paw's lowest point above the ground below its centre [m], negative inside the ground."""
-    pos = arrays.paw_pos[leg, world]
+def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
+    """Write position [m] and velocity [m/s] of a leg's paw centre (`paw_pos`, `paw_vel`), world axes."""
+    paw = paw_motion(arrays, geo, world, leg)
+    arrays.paw_pos[leg, world] = paw.pos
+    arrays.paw_vel[leg, world] = paw.vel
+
+
+@wp.func
+def paw_clearance(geo: LegGeometry, ground: Ground, world: int, pos: wp.vec3) -> float:
+    """Return the height of a paw's lowest point above the ground below its centre `pos` [m], negative inside it."""
     return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
@@ -77,7 +94,7 @@ def track_kernel(
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
     update_contact_timers(arrays, world, leg, down)  # reads paw_vel of the previous policy step: call it first
     update_paw_kinematics(arrays, geometry[leg], world, leg)
-    arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
+    arrays.paw_height[leg, world] = paw_clearance(geometry[leg], ground, world, arrays.paw_pos[leg, world])
     grown_ground = grown_block(world_ground(ground, world), skill.obstacle_margin)
     arrays.collisions[leg, world] = leg_collisions(
         geometry, grown_ground, arrays.joint_q, world * COORDS, leg, skill.self_collision_margin

@@ -145,47 +145,79 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
 
 
 @wp.func
+def of_paws(values: wp.array2d(dtype=float), world: int) -> wp.vec4:
+    """Return a world's values of the paws, from an array (4, num_worlds)."""
+    return wp.vec4(values[0, world], values[1, world], values[2, world], values[3, world])
+
+
+@wp.func
+def of_motors(values: wp.array2d(dtype=float), world: int) -> vec12:
+    """Return a world's values of the motors, from an array (12, num_worlds)."""
+    row = vec12()
+    for m in range(12):
+        row[m] = values[m, world]
+    return row
+
+
+@wp.func
 def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the complete state of a world's robot for rewards, terminations and observations (`RobotView`)."""
+    """Return the complete state of a world's robot for rewards, terminations and observations (`RobotView`).
+
+    Members are assigned as a whole: Warp's reverse pass loses an assignment of one component of a struct's vector.
+    """
     robot = load_base_view(arrays, ground, world)
+    robot.contact_time = of_paws(arrays.contact_time, world)
+    robot.air_time = of_paws(arrays.air_time, world)
+    robot.touchdown_speed = of_paws(arrays.touchdown_speed, world)
+    robot.peak_force = of_paws(arrays.peak_force, world)
+    robot.paw_height = of_paws(arrays.paw_height, world)
     contacts = int(0)
     collisions = int(0)
+    contact = wp.vec4()
+    first_contact = wp.vec4()
+    paw_force = wp.vec4()
+    paw_pos = mat43()
+    paw_vel = mat43()
     for k in range(4):
-        time = arrays.contact_time[k, world]
-        down = time > 0.0
+        down = arrays.contact_time[k, world] > 0.0
         contacts += wp.where(down, 1, 0)
         collisions = collisions | arrays.collisions[k, world]
-        robot.contact[k] = wp.where(down, 1.0, 0.0)
-        robot.first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
-        robot.contact_time[k] = time
-        robot.air_time[k] = arrays.air_time[k, world]
-        robot.touchdown_speed[k] = arrays.touchdown_speed[k, world]
-        robot.paw_force[k] = wp.length(arrays.paw_force[k, world])
-        robot.peak_force[k] = arrays.peak_force[k, world]
-        robot.paw_height[k] = arrays.paw_height[k, world]
+        contact[k] = wp.where(down, 1.0, 0.0)
+        first_contact[k] = wp.where(down and arrays.air_time[k, world] > 0.0, 1.0, 0.0)
+        paw_force[k] = wp.length(arrays.paw_force[k, world])
         for j in range(3):
-            robot.paw_pos[k, j] = arrays.paw_pos[k, world][j]
-            robot.paw_vel[k, j] = arrays.paw_vel[k, world][j]
+            paw_pos[k, j] = arrays.paw_pos[k, world][j]
+            paw_vel[k, j] = arrays.paw_vel[k, world][j]
     robot.contacts = contacts
     robot.collisions = collisions
+    robot.contact = contact
+    robot.first_contact = first_contact
+    robot.paw_force = paw_force
+    robot.paw_pos = paw_pos
+    robot.paw_vel = paw_vel
+
+    angle = vec12()
+    rate = vec12()
+    default_angle = vec12()
     clipped = float(0.0)
     for m in range(12):
         slot = motor_slot(m)
-        rate = arrays.joint_qd[world * DOFS + 6 + slot]
-        angle = arrays.joint_q[world * COORDS + 7 + slot]
-        robot.angle[m] = angle
-        robot.sensed_angle[m] = angle + arrays.joint_offset[m, world]
-        robot.rate[m] = rate
-        robot.joint_acc[m] = (rate - arrays.prev_rate[m, world]) / arrays.step_dt
-        robot.torque[m] = arrays.torque[m, world]
-        robot.prev_torque[m] = arrays.prev_torque[m, world]
-        robot.action[m] = arrays.action[m, world]
-        robot.prev_action[m] = arrays.prev_action[m, world]
-        robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
-        robot.default_angle[m] = arrays.default_angle[m]
+        rate[m] = arrays.joint_qd[world * DOFS + 6 + slot]
+        angle[m] = arrays.joint_q[world * COORDS + 7 + slot]
+        default_angle[m] = arrays.default_angle[m]
         change = arrays.target[m, world] - arrays.filtered_target[m, world]
         clipped += change * change
+    robot.angle = angle
+    robot.sensed_angle = angle + of_motors(arrays.joint_offset, world)
+    robot.rate = rate
+    robot.joint_acc = (rate - of_motors(arrays.prev_rate, world)) / arrays.step_dt
+    robot.torque = of_motors(arrays.torque, world)
+    robot.prev_torque = of_motors(arrays.prev_torque, world)
+    robot.action = of_motors(arrays.action, world)
+    robot.prev_action = of_motors(arrays.prev_action, world)
+    robot.prev_prev_action = of_motors(arrays.prev_prev_action, world)
     robot.clipped = clipped
+    robot.default_angle = default_angle
     return robot
 
 

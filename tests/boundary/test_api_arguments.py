@@ -12,23 +12,25 @@ import pytest
 import torch
 import warp as wp
 
+from hold_height import hold_height
 from jumper_warp import Env, Recipe, Simulation, SolverJumper, build_model, load_policy, make_task, train
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
-from jumper_warp.diff.closed_loop import ClosedLoop
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.sb3 import Sb3VecEnv
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.identification.motions import load_motions
-from jumper_warp.policies.catalog import ONNX, add_files
-from jumper_warp.policies.policy import save_policy
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.identification.actuators import Bench
+from jumper_warp.identification.motions import RecordedMotion, load_motions
+from jumper_warp.policies.catalog import ONNX, add_files, read_files, summarise
+from jumper_warp.policies.policy import blend, save_policy
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.robot.description import DEFAULT_DESCRIPTION, load_description
+from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
-from jumper_warp.robot.motors import jumping_motors, walking_motors
+from jumper_warp.robot.motors import LimitsCfg, jumping_motors, vertical_jump_filter, walking_motors
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.terrain import TerrainCfg
 from jumper_warp.sim.dynamics import WorldRange
@@ -47,7 +49,10 @@ from jumper_warp.viz.rerun import write_rrd
 
 POLICY = POLICIES / "vertical_jump"
 ZEROS = np.zeros(12)
+SQUARE = np.zeros((12, 12))
+TIMES = np.arange(12.0)
 HEIGHT = make_task("vertical-jump").observations.actor[0]
+HOLD = hold_height()
 COMMAND = make_task("vertical-jump").command
 BLIND = dataclasses.replace(make_task("attitude"), observations=ObservationsCfg((), ()))  # a task without observation
 
@@ -62,11 +67,24 @@ def model():
     return build_model(1)
 
 
+def recorded(model):
+    """Return a recorder with two frames of a model of one world."""
+    recorder = Recorder(model)
+    recorder.record(0.0, model.body_q)
+    recorder.record(0.1, model.body_q)
+    return recorder
+
+
+def with_block():
+    """Return a solver of one world with a block."""
+    return SolverJumper(build_model(1), block=BlockCfg((0.9, 0.0)))
+
+
 def contacts_of(model):
     return newton.CollisionPipeline(model).contacts()
 
 
-@pytest.mark.parametrize("other", [None, 3, "x", object(), ZEROS])
+@pytest.mark.parametrize("other", [None, ZEROS])
 @pytest.mark.parametrize(
     ("make", "name"),
     [
@@ -74,7 +92,6 @@ def contacts_of(model):
         (GymEnv, "env"),
         (Sb3VecEnv, "envs"),
         (RslRlVecEnv, "env"),
-        (ClosedLoop, "env"),
         (Rollout, "model"),
         (SolverJumper, "model"),
         (Recorder, "model"),
@@ -86,43 +103,16 @@ def test_another_object_in_place_of_an_environment_or_a_model_is_refused(make, n
         make(other)
 
 
-def test_an_adapter_of_another_adapter_names_what_it_needs(env):
-    with pytest.raises(InputError, match=r"envs must be GymVectorEnv"):
-        Sb3VecEnv(env)
-    with pytest.raises(InputError, match=r"env must be Env"):
-        GymVectorEnv(GymVectorEnv(env))
-
-
-@pytest.mark.parametrize("other", [None, 3, "x"])
-def test_a_solver_steps_states_only(other, model):
-    solver = SolverJumper(model)
-    state = model.state()
-    for states in ((other, state), (state, other)):
-        with pytest.raises(InputError, match=r"^state_(in|out)\.joint_q must have shape"):
-            solver.step(*states, None, None, 0.002)
-    with pytest.raises(InputError, match=r"^control\.joint_f must have shape"):
-        solver.step(state, state, other or object(), None, 0.002)
-    with pytest.raises(InputError, match=r"^motors\.kp must have shape"):
-        solver.step_motors(state, state, other, None, 0.002, 1)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda env, model: RslRlVecEnv(env, metrics_every=0), "metrics_every"),
-        (lambda env, model: RslRlVecEnv(env, metrics_every=math.nan), "metrics_every"),
-        (lambda env, model: RslRlVecEnv(env, metrics_every=1.5), "metrics_every"),
         (lambda env, model: RslRlVecEnv(env, max_episode_length="x"), "max_episode_length"),
         (lambda env, model: env.stages(WorldRange(0, 10)), "worlds"),
-        (lambda env, model: env.stages(WorldRange(-1, 1)), "worlds"),
-        (lambda env, model: env.stages(WorldRange(0, 0)), "worlds"),
-        (lambda env, model: env.stages((0, 1)), "worlds"),
         (lambda env, model: env.sim.advance(1, env.sim.target, worlds=WorldRange(1, 1)), "worlds"),
         (lambda env, model: env.sim.advance(1, env.sim.target, delay=wp.zeros(1, dtype=int, device="cpu")), "delay"),
         (lambda env, model: env.task_arrays(1), "skill"),
-        (lambda env, model: env.task_arrays(-1), "skill"),
         (lambda env, model: env.mirror("x"), "mirror"),
-        (lambda env, model: env.mirror(None), "mirror"),
         (lambda env, model: GymVectorEnv(env, render_size=3), "render_size"),
         (lambda env, model: build_model(1, robot=3), "robot"),
         (lambda env, model: build_model(1, description=3), "description"),
@@ -132,75 +122,52 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: SolverJumper(model, block=3), "block"),
         (lambda env, model: SolverJumper(model, description=3), "description"),
         (lambda env, model: SolverJumper(model, max_sweeps=math.nan), "max_sweeps"),
-        (lambda env, model: SolverJumper(model, max_sweeps=1.5), "max_sweeps"),
         (lambda env, model: SolverJumper(model, dynamics=3), "dynamics"),
         (lambda env, model: Rollout(model, every=True), "every"),
         (lambda env, model: Rollout(model, tolerance=True), "tolerance"),
-        (lambda env, model: ClosedLoop(env, double="no"), "double"),
         (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
         (lambda env, model: train(Recipe(BLIND)), "no observation"),
         (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
-        (lambda env, model: TerrainCfg(rows=1_000_000), "10000 cells"),
         (lambda env, model: register_task("x", lambda: None, about=3), "about"),
         (lambda env, model: register_task("x", lambda: None, ppo={}), "ppo"),
         (lambda env, model: register_task("x", lambda: None, aliases="abc"), "aliases"),
         (lambda env, model: register_task("x", lambda: None, presets={"a": 3}), "preset 'a'"),
-        (lambda env, model: register_task("x", lambda: None, presets={"a": '--ppo.lr "x'}), "preset 'a'"),
         (lambda env, model: BlockCfg((0.9, 0.0), height="x"), "block height"),
         (lambda env, model: BlockCfg((0.9, 0.0), mass=math.inf), "block mass"),
         (lambda env, model: BlockCfg((0.9, 0.0), friction=math.inf), "block friction"),
         (lambda env, model: BlockCfg((0.9,)), "block center"),
-        (lambda env, model: BlockCfg(None), "block center"),
         (lambda env, model: BlockCfg((0.9, 0.0), half=0.4), "block half"),
         (lambda env, model: platform("x"), "height"),
-        (lambda env, model: platform(1e9), "height"),
         (lambda env, model: platform(0.2, edge="x"), "edge"),
         (lambda env, model: platform(0.2, size=1e9), "size"),
         (lambda env, model: platform(0.2, cell=1e-9), "cell"),
         (lambda env, model: uneven("x"), "amplitude"),
-        (lambda env, model: uneven(math.inf), "amplitude"),
         (lambda env, model: uneven(length=1e9), "length"),
         (lambda env, model: uneven(flat_radius=None), "flat_radius"),
         (lambda env, model: uneven(seed="x"), "seed"),
-        (lambda env, model: uneven(seed=-1), "seed"),
         (lambda env, model: TerrainCfg(rows="x"), "rows"),
-        (lambda env, model: TerrainCfg(rows=1.5), "rows"),
         (lambda env, model: TerrainCfg(kinds=3), "kinds"),
         (lambda env, model: TerrainCfg(step=0.1), "step"),
         (lambda env, model: RobotOverlay({"base_mass": 8}), "base_mass"),
-        (lambda env, model: RobotOverlay({"base_mass": ("8",)}), "base_mass"),
-        (lambda env, model: RobotOverlay({}, {"base_mass": 8}), "base_mass"),
-        (lambda env, model: RobotOverlay({}, {"base_mass": ("a", "b")}), "base_mass"),
         (lambda env, model: RobotOverlay(3), "values"),
         (lambda env, model: HEIGHT.replace(mirror=3), "mirror"),
-        (lambda env, model: HEIGHT.replace(mirror=("x",)), "mirror"),
         (lambda env, model: HEIGHT.replace(name=3), "name"),
         (lambda env, model: StateMetric(3, "level"), "name"),
         (lambda env, model: simulate(Rollout(model), *map(torch.zeros, ((1, 12), 19, 18)), trusted="no"), "trusted"),
         (lambda env, model: Recorder(model, labels=3), "labels"),
-        (lambda env, model: Recorder(model, labels=(1,)), "labels"),
-        (lambda env, model: Recorder(model, labels=("a", "b")), "labels"),
         (lambda env, model: Recorder(model, spacing=math.nan), "spacing"),
-        (lambda env, model: Recorder(model, spacing="x"), "spacing"),
         (lambda env, model: Recorder(model, worlds=3), "worlds"),
-        (lambda env, model: Recorder(model, worlds=()), "worlds"),
-        (lambda env, model: Recorder(model, worlds=(0, 0)), "worlds"),
         (lambda env, model: Recorder(model, notes=3), "notes"),
         (lambda env, model: Recorder(model).record("x", model.body_q), "time"),
-        (lambda env, model: Recorder(model).record(math.nan, model.body_q), "time"),
         (lambda env, model: Recorder(model).record(0.0, None), "body_poses"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, "x"), "series"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, states="x"), "states"),
         (lambda env, model: env.sim.advance(None, env.sim.target), "substeps"),
-        (lambda env, model: env.sim.advance(-1, env.sim.target), "substeps"),
         (lambda env, model: env.sim.advance(1, None), "target"),
-        (lambda env, model: env.sim.advance(1, wp.zeros((12, 2), dtype=float, device="cpu")), "target"),
-        (lambda env, model: env.sim.advance(1, env.sim.target, delay=3), "delay"),
         (lambda env, model: SolverJumper(model).update_contacts(None, model.state()), "contacts"),
         (lambda env, model: SolverJumper(model).update_contacts(contacts_of(model), "x"), "state"),
         (lambda env, model: save_policy(Path("none"), "vertical_jump"), "policy"),
         (lambda env, model: jumping_motors("x"), "torque"),
-        (lambda env, model: jumping_motors(lateral_torque="x"), "torque"),
         (lambda env, model: walking_motors(None), "torque"),
         (lambda env, model: Conditions(latency="x"), "latency"),
         (lambda env, model: Conditions(gain_scale=1.0), "gain_scale"),
@@ -215,6 +182,81 @@ def test_a_solver_steps_states_only(other, model):
         (lambda env, model: check_film(Path("x.gif"), (64, 64), "x", 1.0), "fps"),
         (lambda env, model: check_film(Path("x.gif"), (64, 64), 10.0, None), "speed"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, commands=ZEROS), "commands"),
+        (lambda env, model: recorded(model).recording(goals=ZEROS), "goals"),
+        (lambda env, model: recorded(model).recording(goals=np.zeros((5, 1, 3))), "goals"),
+        (lambda env, model: recorded(model).recording(goals=np.zeros((1, 1, 2))), "goals"),
+        (lambda env, model: recorded(model).recording(heights=ZEROS), "heights"),
+        (lambda env, model: recorded(model).save_picture("x.png", true_scale="no"), "true_scale"),
+        (lambda env, model: recorded(model).save_picture("x.png", width=300.5), "width"),
+        (lambda env, model: recorded(model).save_picture("x.png", title=3), "title"),
+        (lambda env, model: recorded(model).save_picture("x.png", eye=(1.0, 2.0)), "eye"),
+        (lambda env, model: recorded(model).save_picture("x.png", eye=(math.nan, 0.0, 0.0)), "eye"),
+        (lambda env, model: recorded(model).save_picture("x.png", field_of_view="x"), "field_of_view"),
+        (lambda env, model: write_film(recorded(model).recording(), "x.gif", eye=(0.0, math.nan, 1.0)), "eye"),
+        (lambda env, model: write_film(recorded(model).recording(), "x.gif", field_of_view=-5.0), "field_of_view"),
+        (lambda env, model: check_film("x.gif", (64, 64, 64), 10.0, 1.0), "size"),
+        (lambda env, model: export_robot("xml", Path("none")), "kind must be mjcf or urdf or usd"),
+        (lambda env, model: blend("vertical_jump", load_policy("vertical_jump"), 0.5), "policy must be"),
+        (lambda env, model: blend(load_policy("vertical_jump"), None, 0.5), "other must be"),
+        (lambda env, model: LimitsCfg(False, 90.0), "angle lower"),
+        (lambda env, model: LimitsCfg("0", 90.0), "angle lower"),
+        (lambda env, model: dataclasses.replace(vertical_jump_filter(), sum=(0.0, 90.0)), "filter sum"),
+        (lambda env, model: dataclasses.replace(vertical_jump_filter(), horizon=True), "filter horizon"),
+        (lambda env, model: with_block().place_blocks((math.nan, 0.0)), "center"),
+        (lambda env, model: with_block().place_blocks("x"), "center"),
+        (lambda env, model: RecordedMotion("x", TIMES, np.zeros((12, 12), bool)), "motion x: target"),
+        (lambda env, model: RecordedMotion("x", TIMES, "targets"), "motion x: target"),
+        (lambda env, model: RecordedMotion("x", TIMES, SQUARE, SQUARE + 1j), "motion x: angle"),
+        (lambda env, model: RecordedMotion("x", TIMES * 1.0e9, SQUARE, SQUARE), "time rises by 1e\\+09 s a row"),
+        (lambda env, model: Bench(*5 * [ZEROS > 0]), "bench: test"),
+        (lambda env, model: Bench(*5 * ["x"]), "bench: test"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).act(np.ones(147, dtype=bool)), "observation must be numbers"),
+        (lambda env, model: GymVectorEnv(GymVectorEnv(env)), "env must be Env"),
+        (lambda env, model: SolverJumper(model).step(3, model.state(), None, None, 0.002), r"state_in\.joint_q must"),
+        (lambda env, model: make_task(1), "name must be a text"),
+        (lambda env, model: load_policy("vertical_jump", "foo"), "no device"),
+        (lambda env, model: Simulation(1, motors=[1]), "motors"),
+        (lambda env, model: Simulation(1, command_filter=[1]), "command_filter"),
+        (lambda env, model: Simulation(1, dt="x"), "dt"),
+        (lambda env, model: Simulation(2, keep_momentum="no"), "keep_momentum must be True or False"),
+        (lambda env, model: Simulation(2).reset([1, 0]), "mask must be bool"),
+        (lambda env, model: Rollout(model, motors=[1]), "motors"),
+        (lambda env, model: Rollout(model, double="no"), "double must be True or False"),
+        (lambda env, model: Rollout(model).run("x", *Rollout(model).standing()), "targets"),
+        (lambda env, model: Rollout(model).set_geometry([["a"] * 10] * 4), "geometry"),
+        (lambda env, model: real_array(np.ma.masked_array(ZEROS, mask=ZEROS == 0.0), "values"), "masked"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).act(np.full(147, np.nan)), "observation"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).filter_targets("x", ZEROS, ZEROS), "target"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).filter_targets(ZEROS, np.full(12, np.nan), ZEROS), "angle"),
+        (lambda env, model: DeployedPolicy(POLICY / ONNX).filter_targets(ZEROS, ZEROS, ZEROS + 1j), "rate"),
+        (lambda env, model: JumpCommand().update(10**400, 4), "vertical_velocity must be"),
+        (lambda env, model: JumpCommand(math.nan), "takeoff_speed must be"),
+        (lambda env, model: JumpCommand().update(0.0, 1.5), "paws_down"),
+        (lambda env, model: PpoCfg(gamma=None), "ppo gamma"),
+        (lambda env, model: PpoCfg(epochs=1.5), "ppo epochs must be int"),
+        (lambda env, model: PpoCfg(hidden="1e-4"), "ppo hidden"),
+        (lambda env, model: dataclasses.replace(jumping_motors().lateral, kp=None), "motor kp"),
+        (lambda env, model: Recipe("vertical-jump"), "recipe task"),
+        (lambda env, model: train("vertical-jump"), "needs a Recipe"),
+        (lambda env, model: TrainCfg(task="../outside"), "task, run_name and tags"),
+        (lambda env, model: TrainCfg("vertical-jump", stop_on_nan="no"), "stop_on_nan must be bool"),
+        (lambda env, model: register_task("mine", 3), "register_task needs names"),
+        (lambda env, model: register_task("a/b", make_task), "register_task needs names"),
+        (lambda env, model: register_task("mine", make_task, replace="no"), "replace must be True or False"),
+        (lambda env, model: load_motions(["/"]), "no npz, csv or parquet file"),
+        (lambda env, model: (env.reset(), env.use_reset_mask()), "before the first reset"),
+        (lambda env, model: Env(HOLD, True), "num_envs must be a whole number"),
+        (lambda env, model: Env(HOLD, 2, randomize=0), "randomize must be True or False, got 0"),
+        (lambda env, model: Env(HOLD, 2, block=3), "block must be BlockCfg or None, got 3"),
+        (lambda env, model: Env(HOLD, 2, handovers=[3]), r"handovers must be a sequence of Handover, got \[3\]"),
+        (lambda env, model: GymVectorEnv(env, tensors="no"), "tensors must be True or False, got 'no'"),
+        (lambda env, model: Conditions(randomize="no"), "randomize must be True or False"),
+        (lambda env, model: HOLD.rewards[0].replace(scale_by_dt="no"), "near_goal: scale_by_dt must be True"),
+        (lambda env, model: HOLD.terminations[0].replace(success="no"), "success must be True or False"),
+        (lambda env, model: env.set(None, 1.0), "the name of a number must be text"),
+        (lambda env, model: env.set("weight", 1.0), "names are like rewards.jump_height.weight"),
+        (lambda env, model: env.set("rewards.orientation.depth", 1.0), "no number 'depth' of a rewards term"),
+        (lambda env, model: env.set("rewards.jump_height.weight", 1.0, "0"), "skill must be an index below 1"),
     ],
 )  # fmt: skip
 def test_an_argument_of_another_type_or_out_of_range_is_named(call, message, env, model):
@@ -222,77 +264,27 @@ def test_an_argument_of_another_type_or_out_of_range_is_named(call, message, env
         call(env, model)
 
 
-@pytest.mark.parametrize("name", [None, 1, [], np.zeros(2), b"vertical-jump"])
-def test_a_task_is_made_from_a_text(name):
-    with pytest.raises(InputError, match="name must be a text"):
-        make_task(name)
+def test_a_path_may_be_a_text(tmp_path, model):
+    folder = str(save_policy(f"{tmp_path}/policy", load_policy("vertical_jump")))
+    add_files(folder, {"notes.txt": b"text"})
+    assert read_files(folder)["notes.txt"] == b"text"
+    assert summarise(folder) == summarise(Path(folder))
+    assert load_description(str(DEFAULT_DESCRIPTION)).urdf == load_description().urdf
+    assert export_robot("urdf", f"{tmp_path}/robot").is_file()
+    check_film("x.gif", (64, 64), 10.0, 1.0)
+    recorder = recorded(model)
+    assert load_npz(str(recorder.save_npz(f"{tmp_path}/x.npz"))).worlds == (0,)
 
 
-@pytest.mark.parametrize("device", ["foo", -1, {}, torch.float16])
-def test_a_policy_moves_to_devices_only(device):
-    with pytest.raises(InputError, match="no device"):
-        load_policy("vertical_jump", device)
-
-
-@pytest.mark.parametrize("name", ["motors", "command_filter", "friction", "gravity", "tolerance", "dt"])
-@pytest.mark.parametrize("value", [[1], "x", 0.0 * 1j])
-def test_a_simulation_names_a_setting_of_another_kind(name, value):
-    with pytest.raises(InputError, match=name):
-        Simulation(1, **{name: value})
-
-
-@pytest.mark.parametrize("mask", [slice(None), "x", object(), [1, 0], torch.ones(2)])
-def test_a_mask_of_worlds_is_bool(mask):
-    with pytest.raises(InputError, match="mask must be bool"):
-        Simulation(2).reset(mask)
-
-
-@pytest.mark.parametrize("name", ["motors", "command_filter", "dt", "tolerance"])
-def test_a_rollout_names_a_setting_of_another_kind(name):
-    with pytest.raises(InputError, match=name):
-        Rollout(build_model(1), **{name: [1]})
-
-
-def test_a_rollout_takes_tensors_with_gradient_and_names_other_inputs():
+def test_a_rollout_takes_tensors_with_gradient():
     rollout = Rollout(build_model(1))
     q, qd = rollout.standing()
     expected = rollout.run(ZEROS[None], q, qd).q.numpy()
     tensor = torch.tensor(q, requires_grad=True)
     np.testing.assert_array_equal(rollout.run(ZEROS[None], tensor, qd).q.numpy(), expected)
-    for targets in (None, 5, "x"):
-        with pytest.raises(InputError, match="targets"):
-            rollout.run(targets, q, qd)
-    with pytest.raises(InputError, match="geometry"):
-        rollout.set_geometry([["a"] * 10] * 4)
 
 
-def test_masked_values_are_no_numbers():
-    with pytest.raises(InputError, match="masked"):
-        real_array(np.ma.masked_array(ZEROS, mask=ZEROS == 0.0), "values")
-
-
-@pytest.mark.parametrize("observation", [None, "x", np.zeros(3), np.zeros((1, 147)), np.full(147, np.nan)])
-def test_a_deployed_policy_names_an_observation_of_another_kind(observation):
-    with pytest.raises(InputError, match="observation"):
-        DeployedPolicy(POLICY / ONNX).act(observation)
-
-
-@pytest.mark.parametrize("values", [None, "x", np.zeros(3), np.full(12, np.nan), ZEROS + 1j])
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_deployed_policy_filters_finite_targets_only(values, place):
-    arguments = [ZEROS, ZEROS, ZEROS]
-    arguments[place] = values
-    with pytest.raises(InputError, match=("target", "angle", "rate")[place]):
-        DeployedPolicy(POLICY / ONNX).filter_targets(*arguments)
-
-
-@pytest.mark.parametrize("values", [(10**400, 4), ("x", 4), (None, 4), (0.0, 1.5), (0.0, "x"), (1j, 4)])
-def test_a_jump_command_takes_a_speed_and_a_number_of_paws(values):
-    with pytest.raises(InputError, match=r"vertical_velocity|paws_down"):
-        JumpCommand().update(*values)
-
-
-@pytest.mark.parametrize("name", ["../outside.txt", "folder/file.txt", "", "..", "a\0b"])
+@pytest.mark.parametrize("name", ["../outside.txt", "", "a\0b", "manifest.json"])
 def test_a_policy_holds_files_of_its_folder_only(name, tmp_path: Path):
     folder = save_policy(tmp_path / "policy", load_policy("vertical_jump"))
     before = sorted(tmp_path.rglob("*"))
@@ -303,64 +295,10 @@ def test_a_policy_holds_files_of_its_folder_only(name, tmp_path: Path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("name", ["epochs", "minibatches", "num_steps", "gamma", "clip", "lr", "hidden"])
-@pytest.mark.parametrize("value", [1.5 + 0j, None, "1e-4", (True,)])
-def test_settings_of_ppo_have_their_type(name, value):
-    with pytest.raises(InputError, match=f"ppo {name}"):
-        PpoCfg(**{name: value})
-
-
-def test_whole_numbers_of_ppo_are_integers():
-    with pytest.raises(InputError, match="ppo epochs must be int"):
-        PpoCfg(epochs=1.5)
-    assert PpoCfg(hidden=[64, 32]).hidden == (64, 32)
-
-
-@pytest.mark.parametrize("name", ["kp", "kd", "peak"])
-def test_constants_of_a_motor_are_numbers(name):
-    with pytest.raises(InputError, match=f"motor {name}"):
-        dataclasses.replace(jumping_motors().lateral, **{name: None})
-
-
-def test_the_task_of_a_recipe_names_its_training():
-    recipe = Recipe(make_task("horizontal-jump"), TrainCfg(num_envs=8))
-    assert recipe.train.task == "horizontal-jump"
-    with pytest.raises(InputError, match="recipe task"):
-        Recipe("vertical-jump")
-    with pytest.raises(InputError, match="needs a Recipe"):
-        train("vertical-jump")
-    with pytest.raises(InputError, match="task, run_name and tags"):
-        TrainCfg(task="../outside")
-
-
-@pytest.mark.parametrize(
-    "arguments", [("mine", 3), ("mine", None), (None, make_task), ("a/b", make_task), ("mine", make_task, ("",))]
-)
-def test_a_task_is_registered_by_names_and_a_function(arguments):
-    name, make, *aliases = arguments
-    with pytest.raises(InputError, match="register_task needs names"):
-        register_task(name, make, aliases=aliases[0] if aliases else ())
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: register_task("mine", make_task, replace="no"),
-        lambda: Rollout(build_model(1), double="no"),
-        lambda: build_model(1, visuals="no"),
-    ],
-)
-def test_switches_are_bools(call):
-    with pytest.raises(InputError, match="must be True or False"):
-        call()
-
-
 def test_paths_are_texts_too(tmp_path: Path, model):
     recorder = Recorder(model)
     recorder.record(0.0, model.body_q)
     assert write_rrd(recorder.recording(), str(tmp_path / "a.rrd")).is_file()
-    with pytest.raises(InputError, match="no npz, csv or parquet file"):
-        load_motions([str(tmp_path)])
     folder = output_dir("results", str(tmp_path / "out"))
     assert write_metrics(str(folder), {"height_m": 0.5}).path.is_file()
 
@@ -370,26 +308,6 @@ def test_a_recording_without_series_is_written(tmp_path: Path):
     recorder = Recorder(model)
     recorder.record(0.0, model.state().body_q)
     assert load_npz(recorder.save_npz(tmp_path / "recording.npz")).series == {}
-
-
-def test_masked_readings_are_refused():
-    policy = DeployedPolicy(POLICY / ONNX)
-    with pytest.raises(InputError, match="angle must be numbers"):
-        policy.filter_targets(ZEROS, np.ma.masked_array(ZEROS, mask=True), ZEROS)
-
-
-def test_a_reset_mask_after_the_first_reset_is_refused():
-    env = Env(make_task("vertical-jump"), 1, device="cpu")
-    env.reset()
-    with pytest.raises(InputError, match="before the first reset"):
-        env.use_reset_mask()
-
-
-def test_a_policy_keeps_its_manifest(tmp_path):
-    save_policy(tmp_path / "policy", load_policy("vertical_jump"))
-    with pytest.raises(PolicyError, match=r"cannot hold a file 'manifest\.json'"):
-        add_files(tmp_path / "policy", {"manifest.json": b"1"})
-    assert load_policy(tmp_path / "policy")
 
 
 def test_a_device_is_not_replaced_by_a_file():

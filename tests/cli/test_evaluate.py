@@ -40,11 +40,6 @@ def test_flags_have_the_values_of_the_tasks_evaluation():
     assert default_flags(evaluation, "play") == HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
 
 
-def test_paper_is_compared_for_the_ranges_of_its_own_test():
-    names = ("vertical-jump", "vertical-jump-mars", "horizontal-jump", "omnidirectional-jump", "velocity-rough")
-    assert [bool(make_task(name).evaluation.paper) for name in names] == [True, False, True, False, True]
-
-
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
     flags = LandingFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)

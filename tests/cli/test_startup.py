@@ -37,3 +37,26 @@ def test_interrupted_command_ends_with_130_and_no_traceback(tmp_path):
     rest = run.communicate()[0]
     assert first and run.returncode == 130
     assert "Traceback" not in rest
+
+
+INTERRUPTED_IMPORT = """
+import signal, sys
+from importlib.abc import MetaPathFinder
+from jumper_warp.utils.startup import prepare_imports
+class Interrupt(MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name == "networkx":
+            signal.raise_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+prepare_imports()
+sys.meta_path.insert(0, Interrupt())
+try:
+    import trimesh
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_ctrl_c_during_an_import_that_catches_all_exceptions_ends_the_command():
+    run = subprocess.run([sys.executable, "-c", INTERRUPTED_IMPORT], capture_output=True, text=True, check=True)
+    assert run.stdout == "interrupted\n"

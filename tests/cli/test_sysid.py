@@ -91,17 +91,6 @@ def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
     assert "motions 1 (0_hung_chirp) and 5 (0_hung_chirp) are the same recording: give it once" in error
 
 
-def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, capsys):
-    pytest.importorskip("cma")
-    out = recorded / "evolved"
-    more = ["--method", "cma", "--max-seconds", "3", "--exclude", "offsets"]
-    with pytest.raises(SystemExit) as end:  # as the offsets are excluded
-        main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--json", "--out", str(out)])
-    assert end.value.code == 3
-    assert capsys.readouterr().out == (out / "report.json").read_text()
-    assert load_overlay(out / "inconsistent.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
-
-
 def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
     bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)

@@ -6,6 +6,7 @@ import pytest
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
 from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.utils.errors import InputError
 from saved_runs import save_run
 
@@ -118,3 +119,68 @@ def test_policies_are_evaluated_with_changed_flags():
     assert comparison.primary_name == "success_rate"
     assert [len(row.values) for row in comparison.primary] == [1, 1]
     assert any(row.metric == "apex_error_abs_mean_m" for row in comparison.exploratory)
+
+
+@pytest.mark.parametrize("line", [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}'])
+def test_a_malformed_line_of_metrics_is_named(runs, line):
+    folder = save_run(runs.parent, "base", 3, [0.9], start=7)
+    (folder / METRICS_FILE).write_bytes(line + b"\n")
+    with pytest.raises(InputError, match=f"{METRICS_FILE} line 1: malformed"):
+        compared(runs, "base", "tuck")
+
+
+def test_an_unfinished_line_of_metrics_does_not_count(runs):
+    folder = save_run(runs.parent, "base", 3, [0.9], start=7)
+    before = (folder / METRICS_FILE).read_bytes()
+    (folder / METRICS_FILE).write_bytes(before + b'{"iteration": 20, "Metr')
+    assert compared(runs, "base", "tuck").primary[0].values[2] == 0.9
+
+
+@pytest.mark.parametrize(
+    ("sources", "message"),
+    [
+        (("base", "tuck", ".."), "no run in this folder"),
+        (("base", "tuck", "several:7"), "no seed 7; seeds: 1, 2"),
+        (("base", "broken"), "no settings of a training"),
+        (("base", "tuck", "file.pt"), "is a file"),
+    ],
+)
+def test_a_source_without_the_named_run_is_refused(runs, sources, message):
+    for name in ("seed_1", "seed_2"):
+        (runs / "several" / name).mkdir(parents=True)
+    (runs / "broken").mkdir()
+    (runs / "broken" / "config.json").write_text("null")
+    (runs / "file.pt").write_bytes(b"")
+    with pytest.raises(InputError, match=message):
+        compared(runs, *sources)
+
+
+@pytest.mark.parametrize("source", ["x=", "=vertical_jump"])
+def test_an_arm_has_a_name_and_a_source(source):
+    with pytest.raises(InputError, match="NAME=SOURCE"):
+        find_arms([source])
+
+
+def test_a_missing_metric_is_refused_with_the_logged_ones(runs):
+    with pytest.raises(InputError, match="there are iteration, Perf/elapsed_s, Metrics/success"):
+        _ = compared(runs, "base", "tuck", primary="Metrics/sucess").primary
+    with pytest.raises(InputError, match="no run has logged Metrics/sucess; base has logged iteration"):
+        compared(runs, "base", "tuck", metric="Metrics/sucess")
+
+
+def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
+    primary = compared(runs, "base", "tuck", primary="-steps_to_80_percent").primary
+    base, tuck = primary
+    steps = [member.curve("Metrics/success")[0] for member in find_arms([runs / "base"])[0].members]
+    np.testing.assert_array_equal(base.values, [each[-1] for each in steps])  # none reaches 80 %
+    assert tuck.improvement == pytest.approx(0.5)
+    first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
+    assert (first.improvement, first.verdict) == (1.0, "better")
+
+
+def test_equal_values_of_all_seeds_are_noted(tmp_path):
+    for name in ("base", "tuck"):
+        for seed in range(1, 6):
+            save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
+    text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
+    assert "**All seeds have the same Metrics/success**" in text

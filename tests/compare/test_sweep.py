@@ -9,7 +9,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, Sweep, open_study, requeue_abandoned, work
 from jumper_warp.compare.sweep_report import PICTURE, importances
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
@@ -45,21 +45,49 @@ def states(sweep):
 
 @pytest.mark.parametrize("storage", ["sqlite", "journal"])
 def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, storage):
-    path = sweep_file(tmp_path, trials=2, storage=storage)
+    path = sweep_file(tmp_path, trials=1, storage=storage)
     main(["sweep", str(path)])
     sweep = read_sweep(path)
-    assert states(sweep) == ["COMPLETE", "COMPLETE"]
-    path = sweep_file(tmp_path, trials=3, storage=storage)
+    assert states(sweep) == ["COMPLETE"]
+    path = sweep_file(tmp_path, trials=2, storage=storage)
     main(["sweep", str(path)])
-    assert states(sweep) == ["COMPLETE"] * 3
+    assert states(sweep) == ["COMPLETE"] * 2
     page = (sweep.folder / "sweep.md").read_text()
-    assert all(f"| trial_00{number} | complete |" in page for number in range(3))
+    assert all(f"| trial_00{number} | complete |" in page for number in range(2))
     assert (sweep.folder / PICTURE).stat().st_size > 10_000
     arms = find_arms([sweep.folder / "vertical-jump"])
-    assert [(arm.name, arm.seeds) for arm in arms] == [(f"trial_00{number}", [1, 2]) for number in range(3)]
+    assert [(arm.name, arm.seeds) for arm in arms] == [(f"trial_00{number}", [1, 2]) for number in range(2)]
     trained = [arm.settings["env.rewards.jump-height.weight"] for arm in arms]
     chosen = [trial.params["env.rewards.jump-height.weight"] for trial in open_study(sweep).get_trials()]
     assert trained == pytest.approx(chosen)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Train/mean_episode_length", "Metrics/success", "metric was 'Train/mean_episode_length'"),
+        ("trials = 3", 'trials = 3\ndirection = "minimize"', "direction was 'maximize', got 'minimize'"),
+        ("[1, 2]", "[1, 3]", r"seeds was \[1, 2\], got \[1, 3\]"),
+        ("--num-envs 8", "--num-envs 16", "flags was"),
+    ],
+)
+def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, message):
+    path = sweep_file(tmp_path)
+    open_study(read_sweep(path))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=message):
+        open_study(read_sweep(path))
+
+
+def test_a_storage_that_fails_in_the_middle_of_a_sweep_is_named(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+
+    def damage(_):
+        (sweep.folder / "study.db").write_bytes(b"no database" * 1000)
+        raise optuna.TrialPruned("damaged")
+
+    with pytest.raises(InputError, match="storage of sweep two_settings"):
+        work(sweep, damage)
 
 
 def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
@@ -76,7 +104,7 @@ def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
 def test_of_two_workers_one_is_killed_and_nothing_is_lost(tmp_path):
     """The killed worker's trial is continued from its checkpoint by the other one."""
     pytest.importorskip("submitit")
-    path = sweep_file(tmp_path, iterations=15, trials=3, more="pruning = false")
+    path = sweep_file(tmp_path, iterations=15, trials=2, more="pruning = false")
     sweep = read_sweep(path)
     jobs = submit(SweepCfg(path, workers=2, slurm=("timeout_min=10",)), sweep.folder)
     killed = None
@@ -86,17 +114,17 @@ def test_of_two_workers_one_is_killed_and_nothing_is_lost(tmp_path):
         if begun and killed is None:
             killed = begun[0]
             os.kill(int(killed.user_attrs[WORKER].partition(":")[2]), signal.SIGKILL)
-        if states(sweep).count("COMPLETE") == 3:
+        if states(sweep).count("COMPLETE") == 2:
             break
         time.sleep(0.5)
     for job in jobs:
         job.wait()
     trials = open_study(sweep).get_trials()
-    assert sorted(trial.state.name for trial in trials) == ["COMPLETE", "COMPLETE", "COMPLETE", "FAIL"]
+    assert sorted(trial.state.name for trial in trials) == ["COMPLETE", "COMPLETE", "FAIL"]
     (again,) = [t for t in trials if t.user_attrs[RUN] == killed.user_attrs[RUN] and t.number != killed.number]
     assert again.params == killed.params
     assert min(again.intermediate_values) > 1  # it did not begin from scratch
-    assert len(list((sweep.folder / "vertical-jump").glob("*/"))) == 3
+    assert len(list((sweep.folder / "vertical-jump").glob("*/"))) == 2
 
 
 def test_a_trial_of_a_killed_worker_is_queued_before_its_parent_asks_for_its_end(tmp_path):
@@ -160,3 +188,31 @@ def test_wrong_files_are_refused(tmp_path):
     path.write_text("task = 'vertical-jump'\nnothing = 1")
     with pytest.raises(InputError, match="nothing"):
         read_sweep(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[1, 2]", "[]", "number of seeds"),
+        ("trials = 2", "trials = 0", "trials must be"),
+        ("{ low = 1, high = 3 }", "{ low = nan, high = 3.0 }", "ppo.epochs must be finite"),
+        ("{ low = 1, high = 3 }", "{ low = 1.0, high = inf }", "ppo.epochs must be finite"),
+        ("ppo.epochs", "seeds", "sets --seeds"),
+        ("--num-envs 8", "--run_name=x", "sets --run-name"),
+        ("--num-envs 8", "--num-envs '8", "No closing quotation"),
+        ("startup_trials = 2", "startup_trials = -1", "startup trials cannot be negative"),
+        ("startup_trials = 2", "seed = -1", "Seed must be between"),
+        ("startup_trials = 2", "grace = nan", "grace must be"),
+        ("startup_trials = 2", 'direction = "up"', "direction must be maximize or minimize"),
+        ("startup_trials = 2", 'name = "../up"', "name may contain"),
+        ("sqlite", "sqlite:////none/none.db", "unable to open"),
+        ("sqlite", "other", "Could not parse"),
+        ("Train/mean_episode_length", "Train/mean_episode", "has not logged Train/mean_episode at its end; it logged"),
+    ],
+)
+def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old, new, message):
+    path = sweep_file(tmp_path, iterations=1, trials=2)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SystemExit):
+        main(["sweep", str(path)])
+    assert message in capsys.readouterr().err

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import pytest
 
@@ -58,9 +59,35 @@ def test_an_arm_with_other_settings_is_refused(tmp_path):
     train_arm(recipe(tmp_path, "--max-iterations", "1"))
     with pytest.raises(InputError, match=r"trained with another env\.rewards\.jump-height\.weight"):
         train_arm(recipe(tmp_path, "--max-iterations", "1", "--env.rewards.jump-height.weight", "7"))
+    with pytest.raises(InputError, match="seeds"):
+        train_arm(recipe(tmp_path, "--max-iterations", "1", "--seeds", "1", "2", "3"))
     renamed = recipe(tmp_path, "--max-iterations", "1", "--env.rewards.jump-height.weight", "7")
     renamed = dataclasses.replace(renamed, train=dataclasses.replace(renamed.train, run_name="other"))
     assert train_arm(renamed).name.endswith("_other")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds", "seed", "unexpected keyword argument 'seed'"),
+        ("[1, 2]", '"12"', "seeds must be"),
+        ("[1, 2]", "[]", "number of seeds"),
+        ('"T"', "3", "title must be str"),
+        ('half = ""', "half = 3", "arm half: "),
+        ('half = ""', 'half = { flags = "" }', "arm half: .*'task'"),
+        ('half = ""', 'half = { task = "vertical-jump", flag = "" }', "arm half: .*'flag'"),
+        ('half = ""', "half = '--a \"b'", "arm half: No closing quotation"),
+        ("friction", "frict", "unexpected keyword argument 'frict'"),
+        ("{ friction = 0.7 }", '"x"', "arms.toml: "),
+    ],
+)
+def test_a_malformed_file_of_arms_is_refused_before_training(tmp_path, capsys, old, new, message):
+    text = 'title = "T"\ntask = "vertical-jump"\nseeds = [1, 2]\nconditions = { friction = 0.7 }\narms.half = ""\n'
+    (tmp_path / "arms.toml").write_text(f'log_root = "{tmp_path}/logs"\n' + text.replace(old, new))
+    with pytest.raises(SystemExit):
+        main(["compare", "--file", str(tmp_path / "arms.toml")])
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "logs").exists()
 
 
 def test_a_file_of_arms_is_trained_and_compared(tmp_path, capsys):

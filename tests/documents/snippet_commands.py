@@ -5,6 +5,7 @@ import dataclasses
 import glob
 import importlib
 import io
+import itertools
 import os
 import runpy
 import shlex
@@ -134,6 +135,9 @@ class Commands:
             self.require(Path(args[args.index("--task-module") + 1]))
             return
         task = None
+        if args[0] == "play" and len(args) > 2 and "-" not in (args[1][0], args[2][0]):  # several motions
+            flags = itertools.dropwhile(lambda arg: arg[0] != "-", args[1:])
+            args = ["play", args[1].rpartition("=")[2], *flags]
         with contextlib.ExitStack() as stack:
             of_policy = args[1:] and args[1][0] != "-" and args[1] != "robot" and "--agent" not in args
             if args[0] in OPENED and of_policy:
@@ -144,7 +148,7 @@ class Commands:
                     )
                 if task and args[0] not in ("evaluate", "play"):
                     args = [args[0], "vertical_jump", *args[2:]]
-            settings = parsed(lambda: main(args)) if args[0] != "completion" else None
+            settings = parsed(lambda: main(args))
         self.check_values(settings)
         default = f"{args[1]}_finetuned" if args[0] == "finetune" else None
         if path := getattr(settings, "out", None) or default:

@@ -15,7 +15,8 @@ def rows_in_file(task):
 
 
 def test_the_file_has_all_tasks():
-    assert {*PAPERS, *PAPERS.values(), *BASES} == set(TASKS)
+    stock = {name for name, entry in TASKS.items() if entry.origin.startswith("jumper_warp.")}
+    assert {*PAPERS, *PAPERS.values(), *BASES} == stock
     assert {row["task"] for row in ROWS} == {*PAPERS, *BASES}
 
 

@@ -57,7 +57,7 @@ JOBS = [
 
 def test_threads_with_an_environment_each_have_the_results_of_a_single_thread():
     expected = [job(seed, task) for job, seed, task in JOBS]
-    turns = [[(i + turn) % len(JOBS) for turn in range(6)] for i in range(4)]  # each thread begins elsewhere
+    turns = [[(i + turn) % len(JOBS) for turn in range(4)] for i in range(4)]  # each thread begins elsewhere
     start = threading.Barrier(4, timeout=60.0)
 
     def run(turns):
@@ -66,6 +66,6 @@ def test_threads_with_an_environment_each_have_the_results_of_a_single_thread():
 
     with ThreadPoolExecutor(4) as pool:
         found = list(itertools.chain(*pool.map(run, turns)))
-    assert len(found) == 24
+    assert len(found) == 16
     for i, (rows, metrics) in found:
         assert torch.equal(rows, expected[i][0]) and metrics == expected[i][1]

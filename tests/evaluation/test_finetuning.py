@@ -123,9 +123,10 @@ def test_ballistic_landing_is_where_a_projectile_on_mars_falls_to_0_3_m():
     policy, rng = Policy.load("mars_horizontal_jump"), np.random.default_rng(0)
     (group,) = make_groups(policy.recipe(), FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
     pos, vel = rng.uniform(0.5, 1.5, (2, 4, 3))  # [m], [m/s]; without rotation, the com and the base move alike
-    state = group.loop.state()
+    with group.gradients as gradients:
+        state = gradients.state
     state.q[:3], state.qd[:3], state.qd[3:] = torch.as_tensor(pos.T), torch.as_tensor(vel.T), 0.0
-    landing = ballistic_landing(group.loop, [state], torch.zeros(4, dtype=torch.int64))
+    landing = ballistic_landing(gradients, [state], torch.zeros(4, dtype=torch.int64))
     time = [np.roots([-0.5 * 3.71, up, height - 0.3]).max() for up, height in zip(vel[:, 2], pos[:, 2], strict=True)]
     expected = pos + vel * np.array(time)[:, None]
     np.testing.assert_allclose(torch.stack(landing).numpy(), expected[:, :2].T, rtol=1e-5)

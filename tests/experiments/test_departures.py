@@ -1,4 +1,4 @@
-"""Ablations of the jumps' departures from the paper, in the files of experiments/departures."""
+"""Files of `jumper compare --file` in experiments: departures from the paper, the paper's techniques, fused kernels."""
 
 import json
 import shlex
@@ -15,11 +15,11 @@ from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.policies.policy import load_policy
-from jumper_warp.registry import load_task_module, make_task
+from jumper_warp.registry import load_task_module
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 
 FOLDER = Path(__file__).parents[2] / "experiments/departures"
-FILES = sorted(FOLDER.glob("*.toml"))
+FILES = sorted(path for path in FOLDER.parent.rglob("*.toml") if "[arms]" in path.read_text())
 
 
 @pytest.fixture(autouse=True)
@@ -32,58 +32,38 @@ def trained(file, name):
     settings = tomllib.loads((FOLDER / file).read_text())
     arm = settings["arms"][name]
     task, flags = (settings["task"], arm) if isinstance(arm, str) else (arm["task"], "")
-    return parse_train([task, *shlex.split(settings["flags"]), *shlex.split(flags)])[0]
+    return parse_train([task, *shlex.split(settings.get("flags", "")), *shlex.split(flags)])[0]
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_every_arm_changes_the_task_or_the_trainer_and_can_be_saved(file):
     settings = tomllib.loads(file.read_text())
-    kept = trained(file, "kept")
+    first = next(iter(settings["arms"]))
+    kept = trained(file, first)
     for name in settings["arms"]:
         recipe = trained(file, name)
         task = recipe.task
         assert task_from_json(json.loads(json.dumps(task_to_json(task)))) == task
         same = replace(task, name=kept.task.name) == kept.task and recipe.train.ppo == kept.train.ppo
-        assert same == (name == "kept"), name
+        assert same == (name == first), name
     values = {key: tuple(each) if isinstance(each, list) else each for key, each in settings["evaluation"].items()}
     replace(default_flags(kept.task.evaluation, "evaluate"), **values)
-    Conditions(**settings["conditions"])
+    Conditions(**settings.get("conditions", {}))
 
 
-def test_ablation_functions_change_only_their_departure():
-    plain, changed = parse_train(["vertical-jump"])[0].task, trained("vertical_jump.toml", "jumping_early").task
-    names = [term.name for term in plain.terminations]
-    assert [term.name for term in changed.terminations] == [name for name in names if name != "early_takeoff"]
-    assert replace(changed, terminations=plain.terminations, name=plain.name) == plain
-    heights = trained("vertical_jump.toml", "goals").task.levels
-    assert [(level.goal_lower[2], level.goal_upper[2]) for level in heights] == [(0.6, 0.75), (0.6, 0.9), (0.6, 1.1)]
-    assert {level.base_height for level in heights} == {(0.22, 0.45)}
-    places = trained("horizontal_jump.toml", "goals").task.levels
-    assert [level.goal_upper for level in places[::2]] == [(0.55, 0, 0), (0.7, 0.1, 0), (0.85, 0.2, 0), (1.0, 0.3, 0)]
-    assert [level.base_height for level in places] == 4 * [(0.22, 0.35), (0.22, 0.45)]
-    assert {level.goal_lower[0] for level in places} == {0.4}
-    again = trained("horizontal_jump.toml", "another_goal").task.levels
-    assert {level.next_jump_probability for level in again} == {0.0}
-
-
-def test_ablations_of_mars_and_omnidirectional_jumps_have_levels_and_limits_of_the_papers():
-    goals = trained("horizontal_jump_mars_loose.toml", "goals").task.levels
-    assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
-        (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
-    ]  # fmt: skip
-    assert {(level.goal_lower[1], level.goal_upper[1]) for level in goals} == {(-0.3, 0.3)} and len(goals) == 8
-    recipe = trained("horizontal_jump_mars_loose.toml", "limits")
-    limits = recipe.task
-    ends = {term.name: term.numbers for term in limits.terminations}
-    assert recipe.train.init_policy == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
-    assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
-    earth, plain = make_task("horizontal-jump"), make_task("omnidirectional-jump")
-    (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")
-    assert ends["turned_touchdown"] == pytest.approx(touchdown, abs=1e-4)
-    assert trained("horizontal_jump_mars_loose.toml", "wide_kernels").task.rewards == earth.rewards
-    around = trained("omnidirectional_jump.toml", "reaches").task.levels
-    assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
-    assert around[0] == plain.levels[0]
+@pytest.mark.parametrize("name", ["vertical_jump", "horizontal_jump"])
+def test_arms_switch_off_initialisation_estimates_and_curriculum(name):
+    file = f"../paper/{name}.toml"
+    task = trained(file, "full").task
+    modes = vars(trained(file, "no_initialisation").task.reset.settings.start_probability)
+    assert {mode for mode, probability in modes.items() if probability} == {"default"}
+    blind = trained(file, "no_estimates").task
+    assert {term.name for term, old in zip(blind.rewards, task.rewards, strict=True) if term != old} == {
+        term.name for term in task.rewards if term.name.startswith("estimated") and term.weight
+    }
+    ends = [term for term, old in zip(blind.terminations, task.terminations, strict=True) if term != old]
+    assert [(term.name[:9], term.numbers["tolerance"]) for term in ends] == [("predicted", 1.0e6)]
+    assert set(trained(file, "no_curriculum").task.levels) == {task.levels[-1]}
 
 
 @pytest.mark.parametrize("randomize", [False, True])

@@ -1,12 +1,11 @@
 """The experiment on starts of identification: which fits count, and lines of an interrupted run."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.identification_starts import bad_probability, saved_fits, summary
+from experiments.identification_starts import bad_probability, summary
 from jumper_warp.utils.output import read_values, write_metrics
 
 
@@ -40,10 +39,3 @@ def test_estimates_pulled_to_the_prior_make_a_fit_bad_more_often():
     fit = SimpleNamespace(covariance=0.25 * np.eye(1), std=np.full(1, 0.5), identified=np.ones(1, dtype=bool))
     # mean error -0.25 * 4 = -1, standard deviation 0.433: 51.8 % are below the interval of 0.98
     assert bad_probability(fit, np.full(1, 4.0), np.random.default_rng(0)) == pytest.approx(0.518, abs=0.02)
-
-
-def test_line_that_was_cut_off_is_computed_again(tmp_path):
-    path, line = tmp_path / "fits.jsonl", json.dumps(fit_line(0, True, True))
-    assert saved_fits(path) == {}
-    path.write_text(f"{line}\n{line[:40]}")
-    assert list(saved_fits(path)) == [(0, 0)]

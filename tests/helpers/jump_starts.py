@@ -47,6 +47,11 @@ class Starts:
         """Return the centres of the paws FL, FR, BL, BR [m], world frame, (selected worlds, 4, 3)."""
         return paws_of(self._model, self.q, self.qd)
 
+    def some_paws(self, chosen: np.ndarray, most: int) -> np.ndarray:
+        """Return `paws` of at most the first `most` worlds of those chosen; chosen: bool, by world."""
+        worlds = np.flatnonzero(chosen)[:most]
+        return paws_of(self._model, self.q[worlds], self.qd[worlds])
+
     def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the components of horizontal vectors (worlds, 3) towards the goal and to its left, (worlds,)."""
         left = np.cross([0.0, 0.0, 1.0], self.along)

@@ -219,6 +219,20 @@ def test_identify_refuses_a_recording_given_twice(standing):
             identify(motions, jumper_parameters())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"parameters": ["latency"]}, "parameters must be ParameterSet"),
+        ({"noise": {"angle": 0.1}}, "noise must be NoiseLevels or None"),
+        ({"dt": "0.001"}, "dt must be float or None"),
+        ({"dt": 0.0}, "dt must lie in 1e-6 to 0.01 s"),
+    ],
+)
+def test_identify_refuses_arguments_of_another_kind(standing, arguments, message):
+    with pytest.raises(InputError, match=message):
+        identify([standing[0].motion], **{"parameters": jumper_parameters(["latency"]), **arguments})
+
+
 def test_identify_refuses_a_robot_that_does_not_move(replay):
     parameters, rng = jumper_parameters(["latency"]), np.random.default_rng(0)
     plan, robots = sample_plan("hung chirp", rng, seconds=0.5), parameters.robots(np.zeros((1, 1)))

@@ -107,3 +107,59 @@ def test_check_signs_names_motors_with_inverted_angles():
         with pytest.raises(InputError, match="motion walk: angles of FL_outer, BR_inner have the sign opposite"):
             check_signs(wrong)
     check_signs(replace(right, angle=math.nan * angle))  # nothing measured
+
+
+@pytest.mark.parametrize("cell", ["1_0", "x", "1,5"])
+def test_a_cell_of_a_csv_file_is_a_plain_number(tmp_path, cell):
+    columns = table_of(random_motion())
+    write_csv(tmp_path / "walk.csv", columns)
+    lines = (tmp_path / "walk.csv").read_text().splitlines()
+    lines[3] = ",".join([f'"{cell}"', *lines[3].split(",")[1:]])
+    (tmp_path / "walk.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match=f"line 4: expected numbers, found '{cell}'"):
+        load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
+
+
+@pytest.mark.parametrize("kind", ["timestamp", "duration"])
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_times_of_a_parquet_file_have_the_unit_of_their_type(tmp_path, kind, unit):
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = table_of(random_motion())
+    del columns["time [ms]"]
+    per_second = {"ms": 1.0e3, "us": 1.0e6, "ns": 1.0e9}[unit]
+    milliseconds = 4 * np.arange(ROWS)
+    counts = (milliseconds * int(per_second / 1.0e3)).astype(np.int64)
+    time = pyarrow.array(counts, pyarrow.int64()).cast(getattr(pyarrow, kind)(unit))
+    parquet.write_table(pyarrow.table({**columns, "time": time}), tmp_path / "walk.parquet")
+    motion = load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
+    np.testing.assert_allclose(motion.time, milliseconds * 1.0e-3, atol=1.0e-12)
+
+
+@pytest.mark.parametrize("name", ["time", "time [ns]"])
+def test_integer_times_need_their_unit(tmp_path, name):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pyarrow = pytest.importorskip("pyarrow")
+    columns = table_of(random_motion())
+    del columns["time [ms]"]
+    counts = 4_000_000 * np.arange(ROWS)
+    parquet.write_table(pyarrow.table({name: counts, **columns}), tmp_path / "walk.parquet")
+    if name == "time":
+        with pytest.raises(InputError, match=r"time rises by 4e\+06 s a row: give its unit"):
+            load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
+    else:
+        motion = load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
+        np.testing.assert_allclose(motion.time, counts * 1.0e-9, atol=1.0e-12)
+
+
+@pytest.mark.parametrize("values", ["bool", "text", "timestamp"])
+def test_a_column_of_a_parquet_file_that_is_no_number_is_refused(tmp_path, values):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pyarrow = pytest.importorskip("pyarrow")
+    columns = table_of(random_motion())
+    column = {"bool": ROWS * [True], "text": ROWS * ["1_0"], "timestamp": np.arange(ROWS).astype("datetime64[ns]")}[
+        values
+    ]
+    parquet.write_table(pyarrow.table({**columns, "position/x": column}), tmp_path / "walk.parquet")
+    with pytest.raises(InputError, match="all columns must hold numbers"):
+        load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)

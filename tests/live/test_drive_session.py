@@ -8,6 +8,8 @@ import pytest
 
 from drive_helpers import session_of
 from jumper_warp.evaluation.skills import SkillNames
+from jumper_warp.live.plots import Plots, series_of
+from jumper_warp.viz.viser import open_server
 
 
 @pytest.fixture(scope="module")
@@ -176,3 +178,16 @@ def test_task_without_sliders_takes_the_values_of_its_labels():
     session.env.command([0.0, 0.0, 0.0, 1.0])
     advance(session, 0.2)
     assert np.isfinite(session.poses).all()
+
+
+def test_undefined_commanded_values_are_absent_from_a_plot_and_do_not_set_its_range(session):
+    server = open_server(0)
+    plots = Plots(server, session, every=3)
+    curves = plots.curves("height")
+    assert np.isnan(curves["commanded"]).all()
+    assert np.isfinite(curves["base"]).all()
+    assert curves["time [s]"][[0, -1]] == pytest.approx([-4.95, 0.0])  # a full axis from the beginning
+    _, base, commanded = series_of(curves)
+    assert (commanded["auto"], commanded["width"]) == (False, 0)
+    assert "auto" not in base
+    server.stop()

@@ -28,6 +28,13 @@ def test_load_returns_the_saved_state(tmp_path):
     assert sorted(entry.name for entry in path.parent.iterdir()) == [path.name, MANIFEST]
 
 
+def test_the_path_of_a_checkpoint_may_be_a_text(tmp_path):
+    path = save_checkpoint(tmp_path, state(7))
+    assert load_checkpoint(str(path))["iteration"] == 7
+    assert latest_checkpoint(str(tmp_path)).path == path
+    assert best_checkpoint(str(tmp_path)) == path
+
+
 def test_newest_and_best_checkpoints_are_kept(tmp_path):
     for iteration, score in enumerate([0.1, 0.9, 0.3, None, 0.2], start=1):
         save_checkpoint(tmp_path, state(iteration), score, max_checkpoints=2)

@@ -58,18 +58,6 @@ def test_cells_shrink_to_divide_the_size():
     assert heights(field)[0, -1] == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: grounds.platform(0.0), "height must not be zero"),
-        (lambda: grounds.uneven(-0.05), "amplitude must be in"),
-    ],
-)
-def test_refuses_impossible_grounds(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()
-
-
 def dropped(field, offset, lift, num_worlds=1):
     """Return a simulation of robots in the standing pose at x = offset [m], paws at z = lift [m], before they fall."""
     sim = simulation(num_worlds, ground=field)

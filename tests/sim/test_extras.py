@@ -9,6 +9,7 @@ import warp as wp
 from newton.sensors import SensorIMU
 from scipy.spatial.transform import Rotation
 
+from columns import DOFS, MOTOR_DOFS
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import NotThisRobotError
 from jumper_warp.sim.mujoco import mujoco_solver
@@ -80,9 +81,10 @@ def test_imu_on_a_site_of_a_standing_robot_measures_gravity(solver):
     for _ in range(120):
         sim.step()
     if solver == "jumper":
-        sim.solver.step_motors(sim.state, sim.state, sim.motors, sim.target, DT, 1, observables=observables)
-    else:
-        sim.solver.step(sim.state, sim.state, sim.control, None, DT, observables=observables)
+        forces = np.zeros(DOFS, dtype=np.float32)
+        forces[MOTOR_DOFS] = sim.torque.numpy()[:, 0]
+        sim.control.joint_f.assign(forces)
+    sim.solver.step(sim.state, sim.state, sim.control, None, DT, observables=observables)
     sensor.update(sim.state, observables=observables)
     turn = Rotation.from_quat(sim.joint_q()[0, 3:7]) * TILT
     # [m/s^2], [rad/s]: on MuJoCo the robot still oscillates slightly

@@ -15,8 +15,6 @@ from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, name_of, task_from_json, task_to_json
 from jumper_warp.tasks.terms import RewardTerm
 
-JUMP = "jumper_warp.kernels.jump"
-
 
 @wp.func
 def base_at_rest(robot: RobotView, state: Any, std_lin_vel: float, std_ang_vel: float) -> float:
@@ -105,15 +103,9 @@ def test_function_of_main_is_saved_under_the_stem_of_its_file(monkeypatch):
     ("change", "message"),
     [
         (lambda t: t.update(version=4), "the task has version 4, expected version 5; commit 7f5b55c3 reads version 4"),
-        (lambda t: t.update(evaluation={"type": "jumper_warp.tasks.randomization:RandomizationCfg"}),
-         "vertical-jump: evaluation must be Evaluation, got Randomi"),
-        (lambda t: t["observations"]["actor"][0].update(mirror=[2]), "wanted_height: mirror must have 1 to 1"),
-        (lambda t: t.pop("terminations"), "missing 1 required .*'terminations'"),
         (lambda t: t.update(wings=2), "task: .* unexpected keyword argument 'wings'"),
         (lambda t: t["rewards"][0].update(fin=0.1), r"task.rewards\[0\]: .* unknown parameter 'fin'"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.state:JumpState"), "is not a @wp.func"),
-        (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:landed_for", steps=1.0), "must return float"),
-        (lambda t: t.update(randomization={"gains": [0.5]}), r"task.randomization: .* gains must be .*, got \(0.5,\)"),
     ],
 )  # fmt: skip
 def test_changed_json_that_is_no_task_is_refused(change, message):

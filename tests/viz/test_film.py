@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from box_robot import RATE, box_recording, colored, pinhole, walk
 from columns import POS
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import film
 from jumper_warp.viz.film import drawn_poses, write_film
+from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.renderer import RayTracer
 
 SIZE = (96, 64)  # [px]
@@ -103,6 +105,28 @@ def test_film_of_chosen_worlds_shows_no_other(tmp_path, canvas):
     assert {shape.body for shape in drawn.shapes} == {-1, 0, 2}
     names = {shape.name for shape in drawn.shapes if shape.name != "shape"}
     assert names == {"goal_0_0", "goal_2_0", "height_0", "height_2"}
+
+
+@pytest.mark.parametrize(
+    ("ranks", "message"),
+    [
+        ([-1], "rank must be in 0 to 0, got -1"),
+        ([1], "rank must be in 0 to 0, got 1"),
+        ([], "number of ranks"),
+        (0, "ranks must be a sequence of int"),
+        (["world_0"], "ranks must be a sequence of int"),
+    ],
+)
+def test_film_of_worlds_that_are_not_recorded_is_refused(tmp_path, canvas, ranks, message):
+    with pytest.raises(InputError, match=message):
+        write_film(box_recording(walk(1.0)), tmp_path / "walk.webp", size=SIZE, ranks=ranks)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("rank", [-1, 1])
+def test_picture_of_a_world_that_is_not_recorded_is_refused(tmp_path, rank):
+    with pytest.raises(InputError, match=f"rank must be in 0 to 0, got {rank}"):
+        write_picture(box_recording(walk(1.0)), tmp_path / "walk.png", rank=rank)
 
 
 @pytest.mark.parametrize("tracing", [False, True])

@@ -45,6 +45,16 @@ def test_viewer_origin_and_checkerboard_follow_a_point(server, shapes):
     assert scene.ground.position[0] % GROUND_PERIOD == 0.0
 
 
+def test_links_are_relative_to_the_followed_point(server, shapes):
+    scene = ViserScene(server.scene, shapes)
+    poses = Simulation(1, device="cpu").links()[0]
+    poses[..., 0] += 30.3
+    scene.follow(np.array([30.3, 0.0, 0.0]))
+    scene.update(poses)
+    np.testing.assert_allclose(scene.links[0].batched_positions[0, :2], [0.0, 0.0], atol=1e-5)
+    assert scene.links[0].name == "/link_0"  # below ROOT it would move with the ground
+
+
 def test_new_goals_replace_earlier_ones(server, shapes):
     scene = ViserScene(server.scene, shapes)
     scene.show_goals([np.zeros(3), np.ones(3)])

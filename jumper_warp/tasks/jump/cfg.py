@@ -212,8 +212,6 @@ class ResetCfg:
         positive = ("command_delay", "long_wait", "next_jump_delay", "lean", "push_length", "push_acceleration")
         check_ranges("reset", self, skip=("start_probability", "ground", "balance_by"), not_negative=positive)
         check_probabilities("reset", self, "long_wait_probability")
-        if self.balance_by not in ("resets", "steps"):
-            raise InputError(f"reset balance_by must be resets or steps, got {self.balance_by!r:.40}")
 
     struct = JumpSettings
     """Type of the kernel struct that `values` returns."""

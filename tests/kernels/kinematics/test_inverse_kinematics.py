@@ -3,6 +3,7 @@
 Motor angles are (12, n): lateral, outer, inner of FL, FR, BL, BR for n robots. Paw positions are (4, n, 3) [m].
 """
 
+import functools
 import importlib
 import math
 from typing import NamedTuple
@@ -252,8 +253,14 @@ def into_limits(q):
     return clamped
 
 
-def nearest_by_sampling(geo, targets):
-    """Return distances [m] (n,) of targets (n, 3) to the reachable set, by finer grids around the 20 best points."""
+@functools.cache
+def nearest_by_sampling(leg):
+    """Return 120 targets (n, 3) around a leg's hip and their distances to the reachable set (n,), both [m].
+
+    The search samples finer and finer grids around the 20 best points.
+    """
+    geo = leg_geometry(load_description())[leg]
+    targets = np.array(geo["hip"]) + np.random.default_rng(leg).uniform(-0.7, 0.7, (120, 3))
     axes = [np.radians(np.linspace(*limits, n)) for limits, n in ((LATERAL, 41), (TRANSVERSAL, 52), (TRANSVERSAL, 52))]
     grid = into_limits(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     centers = grid[cKDTree(sampled_ankle(geo, grid)).query(targets, 20)[1]]
@@ -263,15 +270,14 @@ def nearest_by_sampling(geo, targets):
         miss = np.linalg.norm(sampled_ankle(geo, around) - targets[:, None, None], axis=-1)
         best = miss.argmin(axis=-1)
         centers = np.take_along_axis(around, best[..., None, None], axis=2)[:, :, 0]
-    return miss.min(axis=(1, 2))
+    return targets, miss.min(axis=(1, 2))
 
 
 @pytest.mark.parametrize("leg", [0, 3], ids=["FL", "BR"])
 def test_nearest_reachable_point_is_within_2_mm_of_a_sampled_search(build, leg):
     geo = leg_geometry(load_description())[leg]
-    targets = np.array(geo["hip"]) + np.random.default_rng(leg).uniform(-0.7, 0.7, (120, 3))
+    targets, nearest = nearest_by_sampling(leg)
     motors, _, reachable, residual = build.solve(np.tile(targets, (4, 1, 1)))
-    nearest = nearest_by_sampling(geo, targets)
     assert 0 < reachable[leg].sum() < 60  # of 120: most targets are out of reach
     assert (residual[leg] - nearest).max() < 2.0e-3  # [m]
     assert (residual[leg] - nearest).min() > -3.0e-4  # the sampled search stops near 0.2 mm

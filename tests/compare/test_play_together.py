@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from jump_helpers import make_env, random_actions
+from jumper_warp.cli.main import main
+from jumper_warp.compare.motions import compare_motions
+from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder
+from jumper_warp.registry import make_task
+
+
+def recorded(height, seconds):
+    """Return a recording of a robot with random actions, after a command of a height [m]."""
+    env, log = make_env(1), JumpLog(np.full(1, height), make_task("vertical-jump").termination_names)
+    recorder = EnvRecorder(env, log, [0], notes={"task": "vertical-jump", "policy": "random"})
+    actions = iter(random_actions(1, 60))
+    run_evaluation(
+        lambda obs: next(actions), env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=False
+    )
+    return recorder.recording()
+
+
+@pytest.fixture(scope="module")
+def motions():
+    return {"low": recorded(0.5, 0.3), "high": recorded(0.9, 0.5)}
+
+
+def test_motions_begin_together_and_the_shorter_one_ends_in_its_last_pose(motions):
+    together = compare_motions(motions, make_task("vertical-jump"))
+    low, high = motions.values()
+    assert len(together.times) == len(high.times) == 30
+    np.testing.assert_array_equal(together.body_poses(0)[:18], low.poses)
+    np.testing.assert_array_equal(together.body_poses(0)[18:], np.broadcast_to(low.poses[-1], (12, 21, 7)))
+    np.testing.assert_array_equal(together.body_poses(1), high.poses)
+    np.testing.assert_allclose(together.heights, [0.5, 0.9])
+    assert together.labels == ("low", "high")
+
+
+def test_a_plot_has_one_reward_term_of_all_motions_and_the_sum_comes_first(motions):
+    series = compare_motions(motions, make_task("vertical-jump")).series
+    groups = list(dict.fromkeys(name.partition("/")[0] for name in series))
+    assert groups[:2] == ["height", "reward, sum of all rewards so far"]
+    for group in groups:
+        labels = {name.rpartition(", ")[2].partition(" [")[0] for name in series if name.startswith(f"{group}/")}
+        assert labels == {"low", "high"}
+    total = sum(series[name] for name in series if name.startswith("reward, ") and ", high [" in name)
+    so_far = series["reward, sum of all rewards so far/total, high [1]"]
+    np.testing.assert_allclose(total.sum() - so_far.sum(), so_far[-1], rtol=1e-5)
+
+
+def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
+    for name, recording in motions.items():
+        recording.save_npz(tmp_path / f"{name}.npz")
+    main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", "--out", str(tmp_path / "out")])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
