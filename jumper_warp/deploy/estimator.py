@@ -38,6 +38,9 @@ class EstimatorCfg:
     accel_bias: float = 0.05  # [m/s^2] At the start
     force: float = 20.0  # [N] Least vertical paw force of a contact
     speed: float = 0.6  # [m/s] Largest ankle speed of a contact
+    still: float = 0.3  # [m/s] Largest ankle speed of a contact without motor torque, as on hard stops
+    support: float = 5.0  # [m/s^2] Least filtered vertical specific force of such a contact
+    support_time: float = 0.03  # [s] Time constant of that filter
     gate: float = 5.0  # [1] Innovation in standard deviations beyond which a foot is anchored again
     fix_position: float = 0.005  # [m] Noise of external positions
     fix_rotation: float = 0.01  # [rad] Noise of external orientations
@@ -126,6 +129,7 @@ class Estimator:
         self.gyro_bias = gyro.copy()
         self.accel_bias = np.zeros((n, 3))
         self.contact = np.ones((n, 4), dtype=bool)
+        self.support = np.full(n, 9.81)  # [m/s^2] filtered vertical specific force
         sigma = np.zeros(SIZE)
         sigma[ROT] = [cfg.start_tilt, cfg.start_tilt, 1.0e-4]
         sigma[VEL] = 0.01
@@ -166,6 +170,8 @@ class Estimator:
         cfg = self.cfg
         middle = self.rot @ rotation(0.5 * dt * rate)
         acceleration = (middle @ force[..., None])[..., 0] + GRAVITY
+        vertical = acceleration[:, 2] - GRAVITY[2]
+        self.support = self.support + dt / (dt + cfg.support_time) * (vertical - self.support)
         flow = self._flow(dt)
         self.pos = self.pos + dt * self.vel + 0.5 * dt * dt * acceleration
         self.vel = self.vel + dt * acceleration
@@ -195,7 +201,7 @@ class Estimator:
         return flow
 
     def _detect(self, rate: np.ndarray, ankles: np.ndarray, jacobians: np.ndarray, qd: np.ndarray, torque: np.ndarray):
-        """Set `contact` from the paws' vertical forces, as torques in static balance give them, and ankle speeds."""
+        """Set `contact` from vertical paw forces (torques in static balance), ankle speeds and support."""
         qd, torque = (x.reshape(-1, 4, 3, 1) for x in (qd, torque))
         transposed = np.swapaxes(jacobians, -1, -2)
         # damped least squares: an aligned thigh and shank transmit no force to the motor
@@ -204,7 +210,9 @@ class Estimator:
         speed = self.vel[:, None] + speed @ np.swapaxes(self.rot, -1, -2)
         up = (force * self.rot[:, None, 2]).sum(-1)
         least = np.where(self.contact, 0.5, 1.0) * self.cfg.force
-        self.contact = (up > least) & (np.linalg.norm(speed, axis=-1) < self.cfg.speed)
+        speed = np.linalg.norm(speed, axis=-1)
+        supported = (self.support > self.cfg.support)[:, None]  # hard stops carry load without motor torque
+        self.contact = (speed < self.cfg.speed) & (up > least) | (speed < self.cfg.still) & supported
 
     def _anchor(self, arms: np.ndarray) -> None:
         """Place the feet that are free, or whose innovation is beyond the gate, at the legs' ankles, uncertain."""

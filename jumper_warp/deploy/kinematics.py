@@ -1,7 +1,7 @@
 """Closed-form kinematics of the four legs in NumPy, for programs that run on the robot.
 
-Batched over leading dimensions (...). Legs are FL, FR, BL, BR; motors of a leg lateral, outer, inner. Vectors are in the
-body frame (x forward, y left, z up). `jumper_warp.kernels.kinematics` has the same formulas for the simulation.
+Batched over leading dimensions (...). Legs are FL, FR, BL, BR; motors of a leg lateral, outer, inner. Vectors are in
+the body frame (x forward, y left, z up). `jumper_warp.kernels.kinematics` has the same formulas for the simulation.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ PAW_RADIUS = 0.025  # [m] sphere centred at the ankle
 
 
 def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ankle positions [m], (..., 4, 3), and their Jacobians [m/rad], (..., 4, 3, 3), at angles q (..., 12) [rad].
+    """Return ankle positions [m], (..., 4, 3), and their Jacobians [m/rad], (..., 4, 3, 3), at angles q [rad].
 
-    A Jacobian's columns are the leg's motors. It is large where both knees coincide, outside the joint limits.
+    q: (..., 12). A Jacobian's columns are the leg's motors. It is large where both knees coincide, outside the joint limits.
     """
     lateral, outer, inner = np.moveaxis(q.reshape(*q.shape[:-1], 4, 3), -1, 0)
     outer_do = THIGH * np.stack([FRONT * np.cos(outer), np.sin(outer)], axis=-1)
