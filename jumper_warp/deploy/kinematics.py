@@ -22,7 +22,7 @@ PAW_RADIUS = 0.025  # [m] sphere centred at the ankle
 def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return ankle positions [m], (..., 4, 3), and their Jacobians [m/rad], (..., 4, 3, 3), at angles q [rad].
 
-    q: (..., 12). A Jacobian's columns are the leg's motors. It is large where both knees coincide, outside the joint limits.
+    q: (..., 12). Columns of a Jacobian are the leg's motors. It is large where the knees coincide, beyond the limits.
     """
     lateral, outer, inner = np.moveaxis(q.reshape(*q.shape[:-1], 4, 3), -1, 0)
     outer_do = THIGH * np.stack([FRONT * np.cos(outer), np.sin(outer)], axis=-1)
