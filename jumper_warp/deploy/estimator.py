@@ -1,24 +1,32 @@
 """Contact-aided right-invariant filter: base position, velocity and orientation from IMU, joints and motor torques.
 
-The error is X = exp(xi) X_hat, in the world frame (z up): rotation, velocity, position, four ankles, gyro and
-accelerometer bias. `docs/explanation/estimator.md` derives the equations. All arrays may have a leading dimension of
-robots. The base frame's origin is the position, and the IMU's axes and place are the base frame's.
+The error is X = exp(xi) X_hat, in the world frame (z up): rotation, velocity, position, gyro and accelerometer bias.
+`docs/explanation/estimator.md` derives the equations. All arrays may have a leading dimension of robots. The base
+frame's origin is the position, and the IMU's axes and place are the base frame's.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from jumper_warp.deploy.kinematics import PAW_RADIUS, legs
+from jumper_warp.deploy.sensors import Estimate
 
-ROT, VEL, POS, FEET, GYRO, ACCEL = (slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 21), (21, 24), (24, 27)))
-SIZE = 27
+ROT, VEL, POS, GYRO, ACCEL = (slice(3 * i, 3 * i + 3) for i in range(5))
+SIZE = 15
 GRAVITY = np.array([0.0, 0.0, -9.81])  # [m/s^2]
-FREE = 1.0  # [m] Standard deviation of the ankle of a leg without contact
+IDENTITY = np.eye(3)
+CROSS = np.zeros((3, 9))  # cross product with a vector v: (v @ CROSS) as a matrix (3, 3)
+CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = [1.0, -1.0] * 3
+OUTER = np.zeros((9, 4, 4))
+"""4 q qᵀ - 1 of the quaternion q (xyzw) of a rotation matrix m: m.reshape(9) @ OUTER.reshape(9, 16)."""
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    OUTER[4 * _i] = np.diag([1.0 if row in (_i, 3) else -1.0 for row in range(4)])
+    OUTER[3 * _j + _k, [_j, _k, _i, 3], [_k, _j, 3, _i]] = [1.0, 1.0, -1.0, -1.0]
+    OUTER[3 * _k + _j, [_j, _k, _i, 3], [_k, _j, 3, _i]] = 1.0
 HISTORY = 240  # Updates for which positions are kept for delayed fixes
 
 
@@ -26,73 +34,53 @@ HISTORY = 240  # Updates for which positions are kept for delayed fixes
 class EstimatorCfg:
     """Noise densities, initial standard deviations and thresholds of the filter."""
 
-    gyro_noise: float = 2.0e-3  # [rad/s/√Hz]
-    accel_noise: float = 2.0e-2  # [m/s^2/√Hz]
+    gyro_noise: float = 1.0e-3  # [rad/s/√Hz]
+    accel_noise: float = 1.0e-2  # [m/s^2/√Hz]
     gyro_walk: float = 1.0e-4  # [rad/s^2/√Hz]
     accel_walk: float = 1.0e-3  # [m/s^3/√Hz]
-    slip: float = 0.02  # [m/√s] Random walk of an ankle in contact
-    leg_noise: float = 2.0e-3  # [m] Ankle position from joint angles, per axis
+    paw_noise: float = 0.02  # [m/s] Velocity of a paw at rest, per axis
+    paw_scale: float = 0.05  # [1] Error of a paw's velocity relative to the base, as a fraction of it
+    slip: float = 0.1  # [m/s] Velocity of a paw beyond which it loses weight
+    ground: float = 0.01  # [m] Height of the ground below paws in contact; 1000 if unknown, as is `near` then
+    near: float = 0.04  # [m] Greatest height of a paw in contact
     start_tilt: float = 0.01  # [rad]
     start_height: float = 0.005  # [m]
-    gyro_bias: float = 0.02  # [rad/s] At the start
-    accel_bias: float = 0.05  # [m/s^2] At the start
+    gyro_bias: float = 2.0e-3  # [rad/s] At the start
+    accel_bias: float = 0.03  # [m/s^2] At the start
     force: float = 20.0  # [N] Least vertical paw force of a contact
-    speed: float = 0.6  # [m/s] Largest ankle speed of a contact
-    still: float = 0.3  # [m/s] Largest ankle speed of a contact without motor torque, as on hard stops
+    speed: float = 0.6  # [m/s] Greatest speed of a paw in contact
+    still: float = 0.3  # [m/s] Greatest speed of a paw in contact without motor torque, as on hard stops
     support: float = 5.0  # [m/s^2] Least filtered vertical specific force of such a contact
     support_time: float = 0.03  # [s] Time constant of that filter
-    gate: float = 5.0  # [1] Innovation in standard deviations beyond which a foot is anchored again
     fix_position: float = 0.005  # [m] Noise of external positions
     fix_rotation: float = 0.01  # [rad] Noise of external orientations
 
 
-class Estimate(NamedTuple):
-    """State of the base; each array has the leading dimension of the measurements."""
-
-    position: np.ndarray  # (3,) [m] world
-    velocity: np.ndarray  # (3,) [m/s] of the base frame's origin, world
-    quaternion: np.ndarray  # (4,) xyzw, body to world
-    contact: np.ndarray  # (4,) bool, FL, FR, BL, BR
-    diverged: np.ndarray  # bool: NaN, or a standard deviation above 1 m/s or 0.2 rad
-
-
 def skew(v: np.ndarray) -> np.ndarray:
     """Return the matrices (..., 3, 3) of the cross products with vectors v (..., 3)."""
-    matrix = np.zeros((*v.shape, 3))
-    matrix[..., 0, 1] = -v[..., 2]
-    matrix[..., 0, 2] = v[..., 1]
-    matrix[..., 1, 2] = -v[..., 0]
-    return matrix - np.swapaxes(matrix, -1, -2)
+    return (v @ CROSS).reshape(*v.shape, 3)
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:
     """Return the matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
-    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    angle = np.sqrt((vector * vector).sum(-1) + 1.0e-24)[..., None, None]
     cross = skew(vector)
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * cross @ cross
+    half = np.sin(0.5 * angle) / angle
+    return IDENTITY + np.sin(angle) / angle * cross + 2.0 * half * half * (cross @ cross)
 
 
 def quaternion_of(matrix: np.ndarray) -> np.ndarray:
     """Return the quaternions (..., 4), xyzw, of rotation matrices (..., 3, 3)."""
-    m = matrix
-    trace = np.trace(m, axis1=-2, axis2=-1)[..., None]
-    diagonal = np.diagonal(m, axis1=-2, axis2=-1)
-    # rows of 4 q q^T; the longest is the best conditioned
-    outer = np.empty((*m.shape[:-2], 4, 4))
-    outer[..., :3, :3] = m + np.swapaxes(m, -1, -2)
-    for i in range(3):
-        outer[..., i, i] = 1.0 + 2.0 * diagonal[..., i] - trace[..., 0]
-        outer[..., i, 3] = outer[..., 3, i] = m[..., (i + 2) % 3, (i + 1) % 3] - m[..., (i + 1) % 3, (i + 2) % 3]
-    outer[..., 3, 3] = 1.0 + trace[..., 0]
-    best = np.diagonal(outer, axis1=-2, axis2=-1).argmax(-1)
-    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    outer = (matrix.reshape(*matrix.shape[:-2], 9) @ OUTER.reshape(9, 16)).reshape(*matrix.shape[:-2], 4, 4) + np.eye(4)
+    best = outer.diagonal(axis1=-2, axis2=-1).argmax(-1)  # the longest row is the best conditioned
+    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    return row / np.sqrt((row * row).sum(-1, keepdims=True))
 
 
 def matrix_of(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), xyzw."""
     cross = skew(quaternion[..., :3])
-    return np.eye(3) + 2.0 * quaternion[..., 3, None, None] * cross + 2.0 * cross @ cross
+    return IDENTITY + 2.0 * quaternion[..., 3, None, None] * cross + 2.0 * cross @ cross
 
 
 def level(accel: np.ndarray) -> np.ndarray:
@@ -113,7 +101,7 @@ class Estimator:
     def reset(self, gyro: np.ndarray, accel: np.ndarray, q: np.ndarray, quaternion: np.ndarray | None = None) -> None:
         """Start with a robot at rest on level ground z = 0, above the origin.
 
-        gyro (3,) [rad/s], accel (3,) [m/s^2], q (12,) [rad]: readings at rest, best averaged over some ticks.
+        gyro (3,) [rad/s], accel (3,) [m/s^2], q (12,) [rad]: readings at rest, averaged over some 0.1 s.
         quaternion: (4,) xyzw; None: tilt from accel, yaw 0.
         """
         cfg = self.cfg
@@ -121,25 +109,19 @@ class Estimator:
         gyro, accel, q = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (gyro, accel, q))
         n = len(q)
         self.rot = level(accel) if quaternion is None else matrix_of(np.atleast_2d(quaternion))
-        arms = legs(q)[0] @ np.swapaxes(self.rot, -1, -2)
         self.pos = np.zeros((n, 3))
-        self.pos[:, 2] = PAW_RADIUS - arms[..., 2].mean(-1)
+        self.pos[:, 2] = PAW_RADIUS - (legs(q)[0] @ self.rot[:, 2, :, None]).mean((1, 2))
         self.vel = np.zeros((n, 3))
-        self.feet = self.pos[:, None] + arms
         self.gyro_bias = gyro.copy()
         self.accel_bias = np.zeros((n, 3))
         self.contact = np.ones((n, 4), dtype=bool)
         self.support = np.full(n, 9.81)  # [m/s^2] filtered vertical specific force
-        sigma = np.zeros(SIZE)
-        sigma[ROT] = [cfg.start_tilt, cfg.start_tilt, 1.0e-4]
-        sigma[VEL] = 0.01
-        sigma[POS] = [1.0e-4, 1.0e-4, cfg.start_height]
-        sigma[FEET] = FREE
-        sigma[GYRO] = cfg.gyro_bias
-        sigma[ACCEL] = cfg.accel_bias
+        tilt, spin, force = [cfg.start_tilt] * 2, [cfg.gyro_bias] * 3, [cfg.accel_bias] * 3
+        sigma = np.array([*tilt, 1.0e-4, *[0.01] * 3, 1.0e-4, 1.0e-4, cfg.start_height, *spin, *force])
         self.cov = np.tile(np.diag(sigma**2), (n, 1, 1))
+        self.flow = np.tile(np.eye(SIZE), (n, 1, 1))  # transition matrix of the error
         self.time = 0.0
-        self._past: deque[tuple[float, np.ndarray]] = deque([(0.0, self.pos.copy())], maxlen=HISTORY)
+        self._past: deque[tuple[float, np.ndarray]] = deque([(0.0, self.pos)], maxlen=HISTORY)
 
     def update(
         self, gyro: np.ndarray, accel: np.ndarray, q: np.ndarray, qd: np.ndarray, torque: np.ndarray, dt: float
@@ -150,99 +132,94 @@ class Estimator:
         (12,) [rad/s] and torques (12,) [N m] are those at its end.
         """
         gyro, accel, q, qd, torque = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (gyro, accel, q, qd, torque))
-        self._propagate(gyro - self.gyro_bias, accel - self.accel_bias, dt)
-        ankles, jacobians = legs(q)
-        arms = ankles @ np.swapaxes(self.rot, -1, -2)
-        self._detect(gyro - self.gyro_bias, ankles, jacobians, qd, torque)
-        self._anchor(arms)
-        residual = (arms - (self.feet - self.pos[:, None])).reshape(-1, 12)
-        jacobian = np.zeros((12, SIZE))
-        jacobian[:, FEET] = np.eye(12)
-        jacobian[:, POS] = -np.tile(np.eye(3), (4, 1))
-        noise = np.where(self.contact, self.cfg.leg_noise**2, 1.0e6).repeat(3, axis=-1)
-        self._correct(jacobian, residual, noise)
+        rate = gyro - self.gyro_bias
+        self._propagate(rate, accel - self.accel_bias, dt)
+        self._observe_paws(rate, q, qd.reshape(-1, 4, 3, 1), torque.reshape(-1, 4, 3, 1))
         self.time += dt
-        self._past.append((self.time, self.pos.copy()))
+        self._past.append((self.time, self.pos))
         return self.estimate()
 
     def _propagate(self, rate: np.ndarray, force: np.ndarray, dt: float) -> None:
         """Integrate unbiased rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2] over dt, with the covariance."""
         cfg = self.cfg
-        middle = self.rot @ rotation(0.5 * dt * rate)
+        half = rotation(0.5 * dt * rate)
+        middle = self.rot @ half
         acceleration = (middle @ force[..., None])[..., 0] + GRAVITY
-        vertical = acceleration[:, 2] - GRAVITY[2]
-        self.support = self.support + dt / (dt + cfg.support_time) * (vertical - self.support)
+        self.support = self.support + dt / (dt + cfg.support_time) * (acceleration[:, 2] + 9.81 - self.support)
         flow = self._flow(dt)
         self.pos = self.pos + dt * self.vel + 0.5 * dt * dt * acceleration
         self.vel = self.vel + dt * acceleration
-        self.rot = self.rot @ rotation(dt * rate)
-        noise = np.zeros((len(rate), SIZE))
-        noise[:, GYRO] = cfg.gyro_walk**2 * dt
-        noise[:, ACCEL] = cfg.accel_walk**2 * dt
-        noise[:, FEET] = cfg.slip**2 * dt
+        self.rot = middle @ half
+        self.cov = flow @ self.cov @ flow.swapaxes(-1, -2)
         # flow maps a bias error of one into the error of dt seconds of white noise
-        inputs = flow[:, :, 21:27] / dt
-        inputs[:, 21:27] = 0.0
-        white = np.repeat([cfg.gyro_noise**2, cfg.accel_noise**2], 3) * dt
-        self.cov = flow @ self.cov @ np.swapaxes(flow, -1, -2) + (inputs * white) @ np.swapaxes(inputs, -1, -2)
-        self.cov[:, range(SIZE), range(SIZE)] += noise
+        inputs = flow[:, :9, 9:]
+        white = np.repeat([cfg.gyro_noise**2, cfg.accel_noise**2], 3) / dt
+        self.cov[:, :9, :9] += (inputs * white) @ inputs.swapaxes(-1, -2)
+        self.cov[:, range(9, SIZE), range(9, SIZE)] += np.repeat([cfg.gyro_walk**2, cfg.accel_walk**2], 3) * dt
 
     def _flow(self, dt: float) -> np.ndarray:
-        """Return the transition matrices (n, 27, 27) of the error over dt [s], to second order for the position."""
-        flow = np.tile(np.eye(SIZE), (len(self.pos), 1, 1))
+        """Return the transition matrices (n, 15, 15) of the error over dt [s], to second order for the position."""
+        flow, step = self.flow, -dt * self.rot
         flow[:, VEL, ROT] = dt * skew(GRAVITY)
         flow[:, POS, ROT] = 0.5 * dt * dt * skew(GRAVITY)
-        flow[:, POS, VEL] = dt * np.eye(3)
-        flow[:, ROT, GYRO] = -dt * self.rot
-        flow[:, VEL, ACCEL] = -dt * self.rot
-        flow[:, POS, ACCEL] = -0.5 * dt * dt * self.rot
-        points = np.concatenate([self.vel[:, None], self.pos[:, None], self.feet], axis=1)
-        flow[:, 3:21, GYRO] = (-dt * skew(points) @ self.rot[:, None]).reshape(-1, 18, 3)
+        flow[:, POS, VEL] = dt * IDENTITY
+        flow[:, ROT, GYRO] = flow[:, VEL, ACCEL] = step
+        flow[:, POS, ACCEL] = 0.5 * dt * step
+        flow[:, VEL, GYRO] = skew(self.vel) @ step
+        flow[:, POS, GYRO] = skew(self.pos) @ step
         return flow
 
-    def _detect(self, rate: np.ndarray, ankles: np.ndarray, jacobians: np.ndarray, qd: np.ndarray, torque: np.ndarray):
-        """Set `contact` from vertical paw forces (torques in static balance), ankle speeds and support."""
-        qd, torque = (x.reshape(-1, 4, 3, 1) for x in (qd, torque))
-        transposed = np.swapaxes(jacobians, -1, -2)
-        # damped least squares: an aligned thigh and shank transmit no force to the motor
-        force = -np.linalg.solve(jacobians @ transposed + 1.0e-5 * np.eye(3), jacobians @ torque)[..., 0]
-        speed = np.cross(rate[:, None], ankles) + (jacobians @ qd)[..., 0]
-        speed = self.vel[:, None] + speed @ np.swapaxes(self.rot, -1, -2)
-        up = (force * self.rot[:, None, 2]).sum(-1)
-        least = np.where(self.contact, 0.5, 1.0) * self.cfg.force
-        speed = np.linalg.norm(speed, axis=-1)
-        supported = (self.support > self.cfg.support)[:, None]  # hard stops carry load without motor torque
-        self.contact = (speed < self.cfg.speed) & (up > least) | (speed < self.cfg.still) & supported
+    def _observe_paws(self, rate: np.ndarray, q: np.ndarray, qd: np.ndarray, torque: np.ndarray) -> None:
+        """Detect contacts, and correct with the base velocity and height that paws at rest on the ground imply.
 
-    def _anchor(self, arms: np.ndarray) -> None:
-        """Place the feet that are free, or whose innovation is beyond the gate, at the legs' ankles, uncertain."""
-        variance = np.diagonal(self.cov, axis1=-2, axis2=-1)[:, FEET].reshape(-1, 4, 3)
-        free = variance[..., 0] > 0.25 * FREE**2
-        jump = np.linalg.norm(arms + self.pos[:, None] - self.feet, axis=-1)
-        cross = np.stack([self.cov[:, 9 + i, 6 + i % 3] for i in range(12)], axis=-1).reshape(-1, 4, 3)
-        spread = variance - 2.0 * cross + np.diagonal(self.cov, axis1=-2, axis2=-1)[:, None, POS]
-        far = jump > self.cfg.gate * np.sqrt(spread.max(-1) + self.cfg.leg_noise**2)
-        again = ~self.contact | free | far
-        self.feet = np.where(again[..., None], self.pos[:, None] + arms, self.feet)
-        held = np.ones((len(again), SIZE))
-        held[:, FEET] = ~again.repeat(3, axis=-1)
-        self.cov = self.cov * held[:, :, None] * held[:, None, :]
-        self.cov[:, range(SIZE), range(SIZE)] += (1.0 - held) * FREE**2
+        rate: (n, 3) unbiased [rad/s]; q: (n, 12) [rad]; qd [rad/s], torque [N m]: (n, 4, 3, 1).
+        """
+        cfg = self.cfg
+        up = self.rot[:, 2]
+        ankle, jacobian, turn = legs(q)
+        point = ankle - PAW_RADIUS * up[:, None]  # lowest point of each paw, at rest in rolling contact
+        jacobian += PAW_RADIUS * skew(up)[:, None] @ turn
+        moved = (jacobian @ qd)[..., 0]
+        implied = (moved + point @ skew(rate).swapaxes(-1, -2)) @ -self.rot.swapaxes(-1, -2)
+        residual = implied - self.vel[:, None]
+        height = (point @ up[..., None])[..., 0] + self.pos[:, None, 2]
+        # static balance, as damped least squares: an aligned thigh and shank transmit no force to the motor
+        square = jacobian @ jacobian.swapaxes(-1, -2) + 1.0e-5 * IDENTITY
+        force = -(up[:, None, None] @ np.linalg.solve(square, jacobian @ torque))[..., 0, 0]
+        square = residual * residual
+        speed = np.sqrt(square.sum(-1))
+        pushed = (speed < cfg.speed) & (force > np.where(self.contact, 0.5, 1.0) * cfg.force)
+        supported = (self.support > cfg.support)[:, None]  # hard stops carry load without motor torque
+        self.contact = (pushed | ((speed < cfg.still) & supported)) & (height < cfg.near)
+        # weighted mean of the paws; slipping ones lose weight
+        square[..., :2] = (square[..., 0] + square[..., 1])[..., None]
+        noise = cfg.paw_noise**2 + cfg.paw_scale**2 * (moved * moved).sum(-1)[..., None]
+        weight = self.contact[..., None] / (noise * (1.0 + square / cfg.slip**2))
+        total = weight.sum(1) + 1.0e-9
+        count = self.contact.sum(-1, keepdims=True)
+        center = (self.contact[:, None] @ point)[:, 0] / np.maximum(count, 1)  # of the paws in contact, body frame
+        arm = (self.rot @ center[..., None])[..., 0] + self.pos
+        jacobian = np.zeros((len(q), 4, SIZE))
+        jacobian[:, range(4), [3, 4, 5, 8]] = 1.0
+        jacobian[:, 3, 0] = arm[:, 1]
+        jacobian[:, 3, 1] = -arm[:, 0]
+        implied = np.concatenate([(weight * residual).sum(1) / total, -arm[:, 2:]], axis=1)
+        noise = np.concatenate([1.0 / total, np.where(count > 0, cfg.ground**2, 1.0e9)], axis=1)
+        self._correct(jacobian, implied, noise)
 
     def _correct(self, jacobian: np.ndarray, residual: np.ndarray, noise: np.ndarray) -> None:
-        """Apply a Kalman update; jacobian (..., m, 27), residual (n, m), noise (n, m): variances."""
-        cross = self.cov @ np.swapaxes(jacobian, -1, -2)
-        spread = jacobian @ cross
+        """Apply a Kalman update; jacobian (..., m, 15), residual (n, m), noise (n, m): variances."""
+        cross = jacobian @ self.cov
+        spread = cross @ jacobian.swapaxes(-1, -2)
         spread[:, range(noise.shape[-1]), range(noise.shape[-1])] += noise
-        gain = np.swapaxes(np.linalg.solve(spread, np.swapaxes(cross, -1, -2)), -1, -2)
+        gain = np.linalg.solve(spread, cross).swapaxes(-1, -2)
         error = (gain @ residual[..., None])[..., 0]
-        cov = self.cov - gain @ np.swapaxes(cross, -1, -2)
-        self.cov = 0.5 * (cov + np.swapaxes(cov, -1, -2))
+        cov = self.cov - gain @ cross
+        self.cov = 0.5 * (cov + cov.swapaxes(-1, -2))
         turn = rotation(error[:, ROT])
         self.rot = turn @ self.rot
         self.vel = (turn @ self.vel[..., None])[..., 0] + error[:, VEL]
         self.pos = (turn @ self.pos[..., None])[..., 0] + error[:, POS]
-        self.feet = self.feet @ np.swapaxes(turn, -1, -2) + error[:, FEET].reshape(-1, 4, 3)
         self.gyro_bias = self.gyro_bias + error[:, GYRO]
         self.accel_bias = self.accel_bias + error[:, ACCEL]
 
@@ -254,7 +231,7 @@ class Estimator:
         """
         past = min(self._past, key=lambda entry: abs(entry[0] - time))[1]
         jacobian = np.zeros((len(past), 3, SIZE))
-        jacobian[:, :, POS] = np.eye(3)
+        jacobian[:, :, POS] = IDENTITY
         jacobian[:, :, ROT] = -skew(past)
         self._correct(jacobian, np.atleast_2d(position) - past, np.full((len(past), 3), self.cfg.fix_position**2))
         if quaternion is None:
@@ -262,14 +239,13 @@ class Estimator:
         turn = matrix_of(np.atleast_2d(quaternion)) @ np.swapaxes(self.rot, -1, -2)
         q = quaternion_of(turn)
         jacobian = np.zeros((3, SIZE))
-        jacobian[:, ROT] = np.eye(3)
+        jacobian[:, ROT] = IDENTITY
         noise = np.full((len(past), 3), self.cfg.fix_rotation**2)
         self._correct(jacobian, 2.0 * np.copysign(1.0, q[:, 3:]) * q[:, :3], noise)
 
     def estimate(self) -> Estimate:
         """Return the present estimate."""
-        sigma = np.sqrt(np.diagonal(self.cov, axis1=-2, axis2=-1))
-        bad = ~np.isfinite(self.pos + self.vel).all(-1)
-        diverged = bad | ~(sigma[:, VEL].max(-1) < 1.0) | ~(sigma[:, :2].max(-1) < 0.2)
-        values = (self.pos, self.vel, quaternion_of(self.rot), self.contact, diverged)
+        variance = self.cov.diagonal(axis1=-2, axis2=-1)
+        sure = (np.abs(self.vel).max(-1) < 30.0) & (variance[:, VEL].max(-1) < 1.0) & (variance[:, :2].max(-1) < 0.04)
+        values = (self.pos, self.vel, quaternion_of(self.rot), self.contact, ~sure)
         return Estimate(*(x[0] if self.single else x for x in values))

@@ -11,38 +11,51 @@ import numpy as np
 FRONT = np.array([1.0, 1.0, -1.0, -1.0])
 SIDE = np.array([1.0, -1.0, 1.0, -1.0])
 HIP = np.stack([FRONT * 0.1433, SIDE * np.array([0.105, 0.105, 0.150, 0.150]), np.zeros(4)], axis=1)  # [m] (4, 3)
-OUTER_X = FRONT * 0.1417  # [m] axis of the outer thigh, housing frame
-INNER_X = FRONT * 0.0517  # [m] axis of the inner thigh, housing frame
+AXIS_X = FRONT[:, None] * [0.1417, 0.0517]  # [m] axes of outer and inner thigh, housing frame
 PLANE_Y = SIDE * (0.05945 + 0.00075)  # [m] ankle, housing frame
 THIGH = 0.175  # [m]
 SHANK = 0.300  # [m]
 PAW_RADIUS = 0.025  # [m] sphere centred at the ankle
+OUTWARD = FRONT[:, None] * [1.0, -1.0]  # direction of outer and inner knee at positive angles
+ACROSS = np.array([-1j, 1j])  # turns a vector along the other shank to one across it
+INNER = np.array([0.0, 1.0])
 
 
-def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ankle positions [m], (..., 4, 3), and their Jacobians [m/rad], (..., 4, 3, 3), at angles q [rad].
+def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return ankle positions [m], their Jacobians [m/rad] and those of the paws' rotation [1], at angles q [rad].
 
-    q: (..., 12). Columns of a Jacobian are the leg's motors. It is large where the knees coincide, beyond the limits.
+    q: (..., 12). Shapes (..., 4, 3), (..., 4, 3, 3) twice; a Jacobian's columns are the leg's motors. A paw turns with
+    its inner shank. Jacobians are large where the knees coincide, beyond the limits.
     """
-    lateral, outer, inner = np.moveaxis(q.reshape(*q.shape[:-1], 4, 3), -1, 0)
-    outer_do = THIGH * np.stack([FRONT * np.cos(outer), np.sin(outer)], axis=-1)
-    inner_di = THIGH * np.stack([-FRONT * np.cos(inner), np.sin(inner)], axis=-1)
-    outer_knee = np.stack([OUTER_X + FRONT * THIGH * np.sin(outer), -THIGH * np.cos(outer)], axis=-1)
-    inner_knee = np.stack([INNER_X - FRONT * THIGH * np.sin(inner), -THIGH * np.cos(inner)], axis=-1)
-    span = outer_knee - inner_knee
-    span_sq = np.maximum((span**2).sum(-1), 1.0e-8)
-    rise = FRONT * np.sqrt(np.maximum(SHANK**2 / span_sq - 0.25, 0.0))
-    ankle = 0.5 * (outer_knee + inner_knee) + rise[..., None] * np.stack([span[..., 1], -span[..., 0]], axis=-1)
-    a = (ankle - outer_knee) / SHANK
-    b = (ankle - inner_knee) / SHANK
-    det = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    angles = q.reshape(*q.shape[:-1], 4, 3)
+    sine, cosine = THIGH * np.sin(angles[..., 1:]), THIGH * np.cos(angles[..., 1:])
+    # points of the leg's plane as complex numbers: x forward, z up in the housing frame; last axis outer, inner
+    knee = AXIS_X + OUTWARD * sine - 1j * cosine
+    knee_rate = OUTWARD * cosine + 1j * sine
+    span = knee[..., 0] - knee[..., 1]
+    rise = np.sqrt(np.maximum(SHANK**2 / np.maximum((span * span.conj()).real, 1.0e-8) - 0.25, 0.0))
+    ankle = 0.5 * (knee[..., 0] + knee[..., 1]) - 1j * FRONT * rise * span
+    shank = (ankle[..., None] - knee) / SHANK  # unit vectors
+    det = (shank[..., 0].conj() * shank[..., 1]).imag
     det = np.where(np.abs(det) < 1.0e-4, np.copysign(1.0e-4, det), det)
     # rigid shanks: the ankle's velocity along each shank is that of its knee
-    by_outer = ((a * outer_do).sum(-1) / det)[..., None] * np.stack([b[..., 1], -b[..., 0]], axis=-1)
-    by_inner = ((b * inner_di).sum(-1) / det)[..., None] * np.stack([-a[..., 1], a[..., 0]], axis=-1)
-    c = np.cos(lateral)
-    s = SIDE * np.sin(lateral)
-    arm = np.stack([ankle[..., 0], c * PLANE_Y - s * ankle[..., 1], s * PLANE_Y + c * ankle[..., 1]], axis=-1)
-    columns = [SIDE[:, None] * np.stack([0.0 * c, -arm[..., 2], arm[..., 1]], axis=-1)]
-    columns += [np.stack([d[..., 0], -s * d[..., 1], c * d[..., 1]], axis=-1) for d in (by_outer, by_inner)]
-    return HIP + arm, np.stack(columns, axis=-1)
+    along = (shank.conj() * knee_rate).real / det[..., None]
+    ankle_rate = along * shank[..., ::-1] * ACROSS
+    pitch = (shank[..., 1:].conj() * (INNER * knee_rate - ankle_rate)).imag / SHANK
+    lateral = np.exp(1j * SIDE * angles[..., 0])
+    across = lateral * (PLANE_Y + 1j * ankle.imag)  # y and z
+    position = np.empty(angles.shape)
+    position[..., 0] = ankle.real
+    position[..., 1] = across.real
+    position[..., 2] = across.imag
+    jacobian = np.zeros((*angles.shape, 3))
+    jacobian[..., 1, 0] = -SIDE * across.imag
+    jacobian[..., 2, 0] = SIDE * across.real
+    jacobian[..., 0, 1:] = ankle_rate.real
+    jacobian[..., 1, 1:] = -lateral.imag[..., None] * ankle_rate.imag
+    jacobian[..., 2, 1:] = lateral.real[..., None] * ankle_rate.imag
+    turn = np.zeros_like(jacobian)
+    turn[..., 0, 0] = SIDE
+    turn[..., 1, 1:] = lateral.real[..., None] * pitch
+    turn[..., 2, 1:] = lateral.imag[..., None] * pitch
+    return HIP + position, jacobian, turn

@@ -19,13 +19,13 @@ BITS = 21  # of each component of a captured position or velocity
 
 
 class Estimate(NamedTuple):
-    """State of the base and contacts of the paws."""
+    """State of the base and contacts of the paws; arrays may have a leading dimension of robots."""
 
     position: np.ndarray  # (3,) [m] of the base's origin, world, z = 0 the ground
     velocity: np.ndarray  # (3,) [m/s] of the base's origin, world
     quaternion: np.ndarray  # (4,) xyzw, body to world
     contact: np.ndarray  # (4,) bool, paws FL, FR, BL, BR
-    diverged: bool
+    diverged: np.ndarray | bool  # unknown state: NaN, no frames, or a standard deviation above 1 m/s or 0.2 rad
 
 
 class StateSource(Protocol):
