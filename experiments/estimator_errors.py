@@ -11,11 +11,13 @@ longest flight, walking from half a second on.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jumper_warp.deploy.estimator import GRAVITY, Estimator, matrix_of, quaternion_of
+from jumper_warp.deploy.kinematics import legs
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.sim.simulation import motor_values
@@ -41,6 +43,7 @@ class Args(EvaluationArgs):
     joint_offset: float = 0.3  # [deg] Standard deviation of the offset of each joint angle
     seconds: float = 3.2  # [s] Simulated time
     wait: float = 1.5  # [s] Time before a jump is commanded
+    save: Path | None = None  # npz file for estimator_gtsam.py
 
 
 class Ticks:
@@ -123,25 +126,42 @@ def readings(true: dict[str, np.ndarray], args: Args) -> dict[str, np.ndarray]:
 def errors(true: dict[str, np.ndarray], data: dict[str, np.ndarray], args: Args) -> dict[str, np.ndarray]:
     """Run the estimator and return errors by name, (ticks, robots): velocity [m/s], height [m], tilt [deg]."""
     estimator = Estimator()
-    start = (data[name][REST - 96 : REST].mean(0) for name in ("gyro", "accel", "q"))
-    estimator.reset(*start)
-    pairs: dict[str, list] = {"velocity": [], "height": [], "tilt": [], "diverged": [], "contact": []}
+    estimator.reset(*(data[name][REST - 96 : REST].mean(0) for name in ("gyro", "accel", "q")))
+    names = ("velocity", "height", "tilt", "diverged", "contact", "wrong_contact")
+    found: dict[str, list] = {name: [] for name in names}
     for i in range(REST, len(data["q"])):
-        names = ("gyro", "accel", "q", "qd", "torque")
-        estimate = estimator.update(*(data[name][i] for name in names), float(true["dt"]))
+        readings = (data[name][i] for name in ("gyro", "accel", "q", "qd", "torque"))
+        estimate = estimator.update(*readings, float(true["dt"]))
         pos, vel, rot, contact = (
             true[name][i + 1].repeat(args.num_draws, axis=0) for name in ("pos", "vel", "rot", "contact")
         )
         # the yaw of the start is unknown; velocities are compared in the body frame
-        found = matrix_of(estimate.quaternion)
-        body = [np.swapaxes(r, -1, -2) @ v[..., None] for r, v in ((found, estimate.velocity), (rot, vel))]
-        pairs["velocity"].append(np.linalg.norm((body[0] - body[1])[..., 0], axis=-1))
-        pairs["height"].append(estimate.position[:, 2] - pos[:, 2])
-        up = np.clip((found[:, 2] * rot[:, 2]).sum(-1), -1.0, 1.0)
-        pairs["tilt"].append(np.rad2deg(np.arccos(up)))
-        pairs["diverged"].append(estimate.diverged)
-        pairs["contact"].append((estimate.contact != contact).mean(-1))
-    return {name: np.array(values) for name, values in pairs.items()}
+        turn = matrix_of(estimate.quaternion)
+        body = [(v[:, None] @ r)[:, 0] for r, v in ((turn, estimate.velocity), (rot, vel))]
+        up = np.clip((turn[:, 2] * rot[:, 2]).sum(-1), -1.0, 1.0)
+        values = (
+            np.linalg.norm(body[0] - body[1], axis=-1), estimate.position[:, 2] - pos[:, 2], np.rad2deg(np.arccos(up)),
+            estimate.diverged, estimate.contact, (estimate.contact != contact).mean(-1),
+        )  # fmt: skip
+        for name, value in zip(names, values, strict=True):
+            found[name].append(value)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def save(
+    path: Path, true: dict[str, np.ndarray], data: dict[str, np.ndarray], found: dict[str, np.ndarray],
+    rows: np.ndarray, columns: np.ndarray, args: Args,
+) -> None:  # fmt: skip
+    """Write readings, true states, our errors and the compared ticks and robots to an npz file."""
+    estimator = Estimator()
+    estimator.reset(*(data[name][REST - 96 : REST].mean(0) for name in ("gyro", "accel", "q")))
+    arrays = {name: data[name][REST:] for name in ("gyro", "accel")}
+    arrays |= {f"true_{name}": true[name][REST + 1 :].repeat(args.num_draws, 1) for name in ("pos", "vel", "rot")}
+    arrays |= {"ankle": legs(data["q"][REST:])[0], "contact": found["contact"], "dt": true["dt"]}
+    arrays |= {"start_rot": estimator.rot, "start_pos": estimator.pos, "start_gyro": estimator.gyro_bias}
+    arrays |= {"ours": np.stack([found[name] for name in ("velocity", "height", "tilt")], axis=-1)}
+    arrays |= {"gyro_noise": np.array(estimator.cfg.gyro_noise), "accel_noise": np.array(estimator.cfg.accel_noise)}
+    np.savez(path, **arrays, rows=rows, columns=columns)  # type: ignore[arg-type]
 
 
 def landing(contact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -160,18 +180,23 @@ def main(args: Args) -> dict:
     """Record motions, estimate, plot the errors and return the metrics."""
     run = EvaluationRun.from_args("estimator_errors", args, Evaluation)
     true = record(run, args)
-    found = errors(true, readings(true, args), args)
+    data = readings(true, args)
+    found = errors(true, data, args)
     jumps = isinstance(run.evaluation, (HeightEvaluation, PlaceEvaluation))
     count = found["tilt"].shape[1]
     last, ticks = landing(true["contact"][REST + 1 :])
-    rows = last.repeat(args.num_draws) if jumps else slice(240, None)
-    columns = np.arange(count) if jumps else slice(None)
+    robots, samples = np.arange(count), np.arange(240, len(found["tilt"]))
+    rows, columns = (
+        (last.repeat(args.num_draws), robots) if jumps else (g.ravel() for g in np.meshgrid(samples, robots))
+    )
+    if args.save is not None:
+        save(args.save, true, data, found, rows, columns, args)
     metrics: Metrics = {"flight_max_s": MetricValue(ticks.max() * float(true["dt"]))}
     for name, unit in (("velocity", "m_s"), ("height", "m"), ("tilt", "deg")):
         values = np.abs(found[name][rows, columns])
         metrics[f"{name}_rms_{unit}"] = MetricValue(float(np.sqrt((values**2).mean())), count, over="robots")
         metrics[f"{name}_p95_{unit}"] = MetricValue(float(np.quantile(values, 0.95)), count, over="robots")
-    metrics["wrong_contact_rate"] = MetricValue(float(found["contact"].mean()))
+    metrics["wrong_contact_rate"] = MetricValue(float(found["wrong_contact"].mean()))
     metrics["diverged_rate"] = MetricValue(float(found["diverged"].any(0).mean()), count, over="robots")
     time = np.arange(len(found["tilt"])) * float(true["dt"])
     with figure(run.folder / "errors.png", 1, 3, figsize=(14, 5), title="Estimator", conditions=run.title) as axes:
