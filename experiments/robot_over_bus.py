@@ -9,7 +9,6 @@ the true state, with the motors' torque limits. `--drop 0.01` loses frames, `--d
 
 from __future__ import annotations
 
-import importlib
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +17,13 @@ from typing import cast
 import numpy as np
 
 from jumper_warp.bench.bundle import export_bundle
-from jumper_warp.bench.bus_sim import CONTACT_FORCE, BusFaults, BusSim
+from jumper_warp.bench.bus_sim import CONTACT_FORCE, BusSim, make_simulation
+from jumper_warp.bench.faults import BusFaults
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
+from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.runtime import Request, Runtime, State
-from jumper_warp.deploy.sensors import Estimate
+from jumper_warp.deploy.sensors import Estimate, MotionCapture
 from jumper_warp.deploy.skills import Motion, Walk, rotate
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.motors import jumping_motors, walking_motors
@@ -60,7 +61,7 @@ class Bench:
         self.args = args
         self.bundle = Bundle(folder)
         faults = BusFaults(args.drop, delay=args.delay)
-        self.far = BusSim(open_buses(f"unix:{folder}/bus", "robot"), faults, rate=args.rate)
+        self.far = BusSim(open_buses(f"unix:{folder}/bus", "robot"), faults, sim=make_simulation(1.0 / args.rate))
         self.link = Link(open_buses(f"unix:{folder}/bus"), pump=self.far.serve)
         self.direct = {
             State.JUMP_UP: Simulation(1, motors=jumping_motors(18.0, lateral_torque=10.0), friction=0.85, device="cpu"),
@@ -70,10 +71,8 @@ class Bench:
 
     def runtime(self) -> Runtime:
         """Return a runtime whose robot stands in the default pose, with motors on."""
-        source = None
-        if self.args.estimator:
-            source = importlib.import_module("jumper_warp.deploy.estimator").Estimator()
         self.far.restart()
+        source = Estimator() if self.args.estimator else MotionCapture()
         runtime = Runtime(self.bundle, self.link, source, rate=self.args.rate)
         runtime.tick()
         runtime.tick()
@@ -92,7 +91,7 @@ class Bench:
             for _ in range(steps):
                 for _ in range(round(self.args.rate / 60)):
                     runtime.tick()
-                rows.append([*self.far.q[:7], *self.far._velocity])
+                rows.append([*self.far.q[:7], *self.far.velocity])
                 if runtime.state != state:  # a jump ends, or a fault
                     break
             if runtime.state == State.DAMP:

@@ -14,7 +14,6 @@ import yaml
 
 from jumper_warp.bench.vectors import npz_bytes, vectors_of
 from jumper_warp.deploy.bundle import FILE, VERSION, settings_hash
-from jumper_warp.deploy.check import vectors_file
 from jumper_warp.deploy.codec import dbc
 from jumper_warp.policies.policy import Policy, bundle_onnx
 from jumper_warp.policies.spec import PolicyInterface
@@ -153,7 +152,7 @@ def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
             raise InputError(f"{name}: the bundle already has a policy for {section['skill']}")
         sections[name] = section
         files[f"{name}.onnx"] = bundle_onnx(policy, SKILL_OF_COMMAND)
-        files[vectors_file(name)] = npz_bytes(vectors_of(name, policy))
+        files[f"{name}.npz"] = npz_bytes(vectors_of(name, policy))
     files["jumper.dbc"] = dbc(settings["motors"][:3]).encode()
     files["deploy.pyz"] = runtime_archive()
     settings["policies"] = sections

@@ -32,7 +32,8 @@ def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMot
 
     torque_limit: of the targets' clipping [N m]. Raises InputError: there is none of LEAST_SECONDS.
     """
-    ticks, rate = read_log(folder)
+    ticks, about = read_log(folder)
+    rate = about["rate"]
     state = np.where((ticks["kp"] > 0.0).all(axis=1) & np.isin(ticks["state"], DRIVEN), ticks["state"], -1)
     edges = [0, *(np.flatnonzero(np.diff(state)) + 1), len(state)]
     motions = []
@@ -99,7 +100,8 @@ def play_log(cfg: LogCfg) -> Path:
 
     The first robot is the log, the second the simulation. Raises InputError: the log is damaged.
     """
-    ticks, rate = read_log(cfg.log)
+    ticks, about = read_log(cfg.log)
+    rate = about["rate"]
     simulated = simulated_again(ticks, rate)
     sim = Simulation(2, motors=jumping_motors(), device="cpu")
     recorder = Recorder(sim.model, (0, 1), spacing=1.0, notes={"log": str(cfg.log)}, labels=["log", "simulation"])

@@ -6,6 +6,7 @@ import heapq
 import itertools
 import select
 import time
+from contextlib import suppress
 
 import can
 
@@ -15,10 +16,10 @@ from jumper_warp.deploy.realtime import request_real_time
 WIRE_TIME = 1.2e-4  # [s] of a frame of 8 bytes at 1 Mbit/s
 
 
-def serve_in_real_time(far: BusSim, seconds: float, *, wire: bool = True, latency: float = 1.0e-4) -> None:
+def serve_in_real_time(far: BusSim, seconds: float, latency: float) -> None:
     """Answer commands as they arrive, and advance the simulation by a tick each far.dt [s].
 
-    wire: whether a frame occupies its bus for WIRE_TIME. latency: of a motor's reply [s].
+    A frame occupies its bus for WIRE_TIME. latency: of a motor's reply [s].
     """
     request_real_time()
     pending: list[tuple[float, int, int, can.Message]] = []  # time, order, bus, frame
@@ -29,17 +30,15 @@ def serve_in_real_time(far: BusSim, seconds: float, *, wire: bool = True, latenc
 
     def occupy(number: int, now: float) -> float:
         """Return when a frame that is ready at `now` has passed a bus."""
-        free[number] = max(free[number], now) + (WIRE_TIME if wire else 0.0)
+        free[number] = max(free[number], now) + WIRE_TIME
         return free[number]
 
     while due - start < seconds:
         now = time.monotonic()
         while pending and pending[0][0] <= now:
             _, _, number, message = heapq.heappop(pending)
-            try:
+            with suppress(can.CanError):  # nobody listens
                 far.send(far.buses[number], message)
-            except can.CanError:
-                pass  # nobody listens
         if now >= due:
             far.advance()
             for message in far.sensors():

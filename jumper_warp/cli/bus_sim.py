@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
+from jumper_warp.bench.faults import BusFaults
 from jumper_warp.cli.main import parse
 
 
-@dataclass(frozen=True)
-class BusSimCfg:
+@dataclass
+class BusSimCfg(BusFaults):
     """Simulate the far end of the robot's buses: twelve motors, an IMU and a motion capture."""
 
     bus: str = "unix:/tmp/jumper-bus"
@@ -19,15 +20,7 @@ class BusSimCfg:
     rate: int = 480  # [Hz] Ticks a second
     seconds: float = 3600.0  # [s] End after this time
     friction: float = 0.85  # [1] Of the paws
-    drop: float = 0.0  # Probability that a frame is lost
-    corrupt: float = 0.0  # Probability that a frame arrives as an error frame
-    delay: float = 0.0  # Probability that a motor gets its command a tick late
-    wire: bool = True  # Whether frames take 0.12 ms each on their bus, in real time
     latency: float = 0.1  # [ms] From a command to the motor's reply, in real time
-    temperature: float = 35.0  # [°C] Of the motors
-    error_code: int = 0  # Of the first motor's replies
-    motor_own_id: bool = False  # Motors reply under their own id, as some firmware
-    seed: int = 0  # Of lost, corrupt and late frames
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -36,21 +29,19 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     Raises InputError: the bus cannot be opened, or a flag is wrong.
     """
     cfg = parse(BusSimCfg, "bus-sim", args)
-    from jumper_warp.bench.bus_sim import BusFaults, BusSim
+    from jumper_warp.bench.bus_sim import BusSim, make_simulation
     from jumper_warp.bench.pace import serve_in_real_time
     from jumper_warp.deploy.bus import open_buses
 
-    faults = BusFaults(cfg.drop, cfg.corrupt, cfg.delay, cfg.temperature, cfg.motor_own_id, cfg.seed)
-    far = BusSim(open_buses(cfg.bus, "robot"), faults, rate=cfg.rate, friction=cfg.friction)
-    far.error_code[0] = cfg.error_code
+    far = BusSim(open_buses(cfg.bus, "robot"), cfg, sim=make_simulation(1.0 / cfg.rate, cfg.friction))
     print(f"bus-sim on {cfg.bus}", flush=True)
     try:
-        if not cfg.lockstep:
-            serve_in_real_time(far, cfg.seconds, wire=cfg.wire, latency=1.0e-3 * cfg.latency)
-            return
-        ticks = 0
-        while ticks < cfg.seconds * cfg.rate and far.serve():
-            ticks += 1
+        if cfg.lockstep:
+            for _ in range(round(cfg.seconds * cfg.rate)):
+                if not far.serve():
+                    break
+        else:
+            serve_in_real_time(far, cfg.seconds, 1.0e-3 * cfg.latency)
     except KeyboardInterrupt:
         pass
     finally:

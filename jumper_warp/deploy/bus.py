@@ -33,6 +33,11 @@ LOCKSTEP_TIMEOUT = 30.0  # [s] Longest wait for the other side in lockstep
 _FRAME = struct.Struct("<IBB8s")  # id, length, whether it is an error frame, data
 
 
+def data_frame(number: int, data: bytes, bus: int | None = None) -> can.Message:
+    """Return a data frame with an arbitration id; bus: number of its bus."""
+    return can.Message(arbitration_id=number, data=data, is_extended_id=False, channel=bus)
+
+
 class UnixBus(can.BusABC):
     """Bus over Unix datagrams between two sockets of this machine."""
 
@@ -50,25 +55,21 @@ class UnixBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame at once. Raises CanOperationError: the queue is full, or nobody has bound the peer."""
-        data = _FRAME.pack(msg.arbitration_id, len(msg.data), msg.is_error_frame, bytes(msg.data))
         try:
-            self._socket.sendto(data, self._peer)
+            self._socket.sendto(_FRAME.pack(msg.arbitration_id, msg.dlc, msg.is_error_frame, msg.data), self._peer)
         except OSError as error:
             raise can.CanOperationError(f"{self._peer}: {error}") from error
 
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Return the next frame, or None after `timeout` [s], and that frames are not filtered."""
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame, or None after `timeout` [s]."""
         try:
             packet = self._socket.recv(_FRAME.size)
         except BlockingIOError:
             if timeout == 0.0 or not select.select([self._socket], [], [], timeout)[0]:
-                return None, False
+                return None
             packet = self._socket.recv(_FRAME.size)
-        arbitration_id, length, error, data = _FRAME.unpack(packet)
-        message = can.Message(
-            arbitration_id=arbitration_id, data=data[:length], is_error_frame=bool(error), is_extended_id=False
-        )
-        return message, False
+        number, length, error, data = _FRAME.unpack(packet)
+        return can.Message(arbitration_id=number, data=data[:length], is_error_frame=bool(error), is_extended_id=False)
 
     def fileno(self) -> int:
         """Return the socket's file descriptor."""
@@ -150,7 +151,7 @@ class Link:
 
     def _send(self, leg: int, bus: can.BusABC, arbitration_id: int, data: bytes) -> None:
         """Send one frame on the bus of a leg."""
-        message = can.Message(arbitration_id=arbitration_id, data=data, is_extended_id=False, channel=leg)
+        message = data_frame(arbitration_id, data, leg)
         if self._listener is not None and arbitration_id != SYNC:
             message.timestamp = time.time()
             self._listener(message)
@@ -165,9 +166,7 @@ class Link:
         Data of frames that did not come are the last ones received.
         """
         record = self.received
-        for name in ("motor_fresh", "sensor_fresh"):
-            record[name] = False
-        for name in ("error_frames", "unknown"):
+        for name in ("motor_fresh", "sensor_fresh", "error_frames", "unknown"):
             record[name] = 0
         if self._lockstep:
             if self._pump is not None:

@@ -6,8 +6,6 @@ order or sign of joints, degrees in place of radians, or a wrong history differ 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from jumper_warp.deploy.bundle import Bundle
@@ -17,17 +15,11 @@ from jumper_warp.utils.errors import InputError
 TOLERANCE = 1.0e-5  # of observations and actions; rounding of the network's sums
 
 
-def vectors_file(name: str) -> str:
-    """Return the name of the file with a policy's vectors."""
-    return f"{name}.npz"
-
-
 def check_bundle(bundle: Bundle) -> list[str]:
     """Return a line for each difference between a bundle and its vectors; an empty list: it conforms."""
     differences = []
     for name in bundle.policies:
-        path = bundle.file(vectors_file(name))
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(bundle.file(f"{name}.npz"), allow_pickle=False) as file:
             vectors = {key: file[key] for key in file.files}
         differences += [f"{name}: {line}" for line in _check_policy(bundle, name, vectors)]
     return differences
@@ -71,8 +63,3 @@ def _check_policy(bundle: Bundle, name: str, vectors: dict[str, np.ndarray]) -> 
         compare("filtered target [rad]", filtered, vectors["target"][step])
     policy.reset()
     return [f"{kind} differ by up to {error:.3g}" for kind, error in worst.items() if not error <= TOLERANCE]
-
-
-def check_folder(folder: str | Path) -> list[str]:
-    """Return the differences of the bundle in a folder; see `check_bundle`. Raises InputError: it cannot be read."""
-    return check_bundle(Bundle(folder))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumper_warp.deploy.kinematics import PAW_RADIUS, legs
-from jumper_warp.deploy.sensors import Estimate
+from jumper_warp.deploy.sensors import Estimate, unpack_capture
 
 ROT, VEL, POS, GYRO, ACCEL = (slice(3 * i, 3 * i + 3) for i in range(5))
 SIZE = 15
@@ -38,20 +38,22 @@ class EstimatorCfg:
     accel_noise: float = 1.0e-2  # [m/s^2/√Hz]
     gyro_walk: float = 1.0e-4  # [rad/s^2/√Hz]
     accel_walk: float = 1.0e-3  # [m/s^3/√Hz]
-    paw_noise: float = 0.02  # [m/s] Velocity of a paw at rest, per axis
+    paw_noise: float = 0.04  # [m/s] Velocity of a paw at rest, per axis
     paw_scale: float = 0.05  # [1] Error of a paw's velocity relative to the base, as a fraction of it
-    slip: float = 0.1  # [m/s] Velocity of a paw beyond which it loses weight
+    slip: float = 0.05  # [m/s] Velocity of a paw beyond which it loses weight
     ground: float = 0.01  # [m] Height of the ground below paws in contact; 1000 if unknown, as is `near` then
     near: float = 0.04  # [m] Greatest height of a paw in contact
     start_tilt: float = 0.01  # [rad]
     start_height: float = 0.005  # [m]
-    gyro_bias: float = 2.0e-3  # [rad/s] At the start
+    gyro_bias: float = 1.0e-3  # [rad/s] At the start
     accel_bias: float = 0.03  # [m/s^2] At the start
     force: float = 20.0  # [N] Least vertical paw force of a contact
     speed: float = 0.6  # [m/s] Greatest speed of a paw in contact
     still: float = 0.3  # [m/s] Greatest speed of a paw in contact without motor torque, as on hard stops
     support: float = 5.0  # [m/s^2] Least filtered vertical specific force of such a contact
     support_time: float = 0.03  # [s] Time constant of that filter
+    start_place: float = 1.0e-4  # [m], [rad] Horizontal position and yaw; larger with fixes in another frame
+    fix_delay: float | None = None  # [s] Age of the captured frames that correct the state; None: unused
     fix_position: float = 0.005  # [m] Noise of external positions
     fix_rotation: float = 0.01  # [rad] Noise of external orientations
 
@@ -116,8 +118,8 @@ class Estimator:
         self.accel_bias = np.zeros((n, 3))
         self.contact = np.ones((n, 4), dtype=bool)
         self.support = np.full(n, 9.81)  # [m/s^2] filtered vertical specific force
-        tilt, spin, force = [cfg.start_tilt] * 2, [cfg.gyro_bias] * 3, [cfg.accel_bias] * 3
-        sigma = np.array([*tilt, 1.0e-4, *[0.01] * 3, 1.0e-4, 1.0e-4, cfg.start_height, *spin, *force])
+        tilt, spin, force, place = [cfg.start_tilt] * 2, [cfg.gyro_bias] * 3, [cfg.accel_bias] * 3, cfg.start_place
+        sigma = np.array([*tilt, place, *[0.01] * 3, place, place, cfg.start_height, *spin, *force])
         self.cov = np.tile(np.diag(sigma**2), (n, 1, 1))
         self.flow = np.tile(np.eye(SIZE), (n, 1, 1))  # transition matrix of the error
         self.time = 0.0
@@ -222,6 +224,12 @@ class Estimator:
         self.pos = (turn @ self.pos[..., None])[..., 0] + error[:, POS]
         self.gyro_bias = self.gyro_bias + error[:, GYRO]
         self.accel_bias = self.accel_bias + error[:, ACCEL]
+
+    def receive(self, frames: np.ndarray) -> None:
+        """Correct with the frames of a motion capture, (3, 8) uint8, if `fix_delay` is set."""
+        if self.cfg.fix_delay is not None:
+            captured = unpack_capture(frames)
+            self.fix(captured.position, captured.quaternion, self.time - self.cfg.fix_delay)
 
     def fix(self, position: np.ndarray, quaternion: np.ndarray | None, time: float) -> None:
         """Correct with a position (3,) [m], world, and orientation (4,) xyzw or None, measured at `time` [s] on `time`.

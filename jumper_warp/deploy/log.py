@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.bus import Link
 from jumper_warp.deploy.runtime import TICK, Request, Runtime
-from jumper_warp.deploy.sensors import StateSource
+from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_file, read_json
 
@@ -22,40 +21,34 @@ VERSION = 1
 
 
 class Log:
-    """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and, on request, the frames."""
+    """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
-    def __init__(self, folder: Path, bundle: Bundle, rate: int, frames: str = "frames.blf") -> None:
-        """Create the folder and the files; frames: name of the file of frames (.asc, .blf, .csv), "" for none."""
+    def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
+        """Create the folder and the files; capture: whether the source is a `MotionCapture`; frames: .asc, .blf, .csv."""
         folder.mkdir(parents=True, exist_ok=True)
-        about = {"version": VERSION, "rate": rate, "bundle": bundle.settings.get("sha256"), "tick_bytes": TICK.itemsize}
+        about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
         self._ticks = (folder / TICKS).open("wb")
-        self._frames = can.Logger(str(folder / frames)) if frames else None
+        self.frame = can.Logger(str(folder / frames))  # writes a frame, for `Link`
 
     def tick(self, record: np.ndarray) -> None:
         """Write the record of a tick."""
         self._ticks.write(record.tobytes())
 
-    @property
-    def frame(self) -> Callable[[can.Message], Any] | None:
-        """Function that writes a frame, for `Link`; None without a file of frames."""
-        return self._frames
-
     def close(self) -> None:
         """Close the files."""
         self._ticks.close()
-        if self._frames is not None:
-            self._frames.stop()
+        self.frame.stop()
 
 
-def read_log(folder: Path) -> tuple[np.ndarray, int]:
-    """Return the ticks of a log, records of TICK, and their rate [Hz]. Raises InputError: it is damaged."""
+def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
     about = read_json(folder / ABOUT, "log of a robot")
     if about.get("version") != VERSION or about.get("tick_bytes") != TICK.itemsize:
         raise InputError(f"{folder / ABOUT}: written by another version of the runtime")
     data = read_file(folder / TICKS, "ticks of a log")
-    return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), int(about["rate"])
+    return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), about
 
 
 class _Replayed(Link):
@@ -74,14 +67,16 @@ class _Replayed(Link):
         return next(self._records)["received"]
 
 
-def replay(ticks: np.ndarray, bundle: Bundle, rate: int, source: StateSource | None = None) -> int:
-    """Run the runtime on the frames and requests of a log; return the first tick that differs, or -1.
+def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
+    """Run the runtime on the frames and requests of a log; return its ticks, and the first that differs, or -1.
 
-    A log of a robot in PASSIVE from its first tick on replays bit for bit, given the same kind of source.
+    A log of a robot in PASSIVE from its first tick on replays bit for bit.
     """
-    runtime = Runtime(bundle, _Replayed(ticks), source, rate=rate)
+    ticks, about = read_log(folder)
+    source = MotionCapture() if about["capture"] else None
+    runtime = Runtime(bundle, _Replayed(ticks), source, rate=about["rate"])
     for number, logged in enumerate(ticks):
         ours = runtime.tick(Request(int(logged["request"])), logged["values"], float(logged["late"]))
         if ours.tobytes() != logged.tobytes():
-            return number
-    return -1
+            return len(ticks), number
+    return len(ticks), -1

@@ -11,10 +11,11 @@ from pathlib import Path
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.check import check_bundle
-from jumper_warp.deploy.log import Log, read_log, replay
-from jumper_warp.deploy.operator import HELP, Command, Keyboard, Script, raw_terminal
+from jumper_warp.deploy.log import Log, replay
+from jumper_warp.deploy.operator import HELP, Keyboard, Script, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
 from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
 from jumper_warp.utils.errors import InputError
 
@@ -29,13 +30,13 @@ def parser() -> argparse.ArgumentParser:
     flags.add_argument("--bus", help="socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER")
     flags.add_argument("--rate", type=int, choices=(480, 500), help="ticks a second (default: of deploy.yaml)")
     flags.add_argument("--dry-run", action="store_true", help="compute commands, and keep the motors off")
+    flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
     flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
     flags.add_argument("--seconds", type=float, default=float("inf"), help="[s] end after this time")
     flags.add_argument("--demo", action="store_true", help="stand up, walk and jump without an operator (bus-sim only)")
     flags.add_argument("--height", type=float, default=0.7, help="[m] height of the base in jumps up (key j)")
     flags.add_argument("--place", type=float, nargs=2, default=(0.5, 0.0), help="[m] ahead and left (key g)")
     flags.add_argument("--log", type=Path, help="folder for the log")
-    flags.add_argument("--no-watchdog", action="store_true", help="start no watchdog process")
     return flags
 
 
@@ -47,68 +48,52 @@ def main(args: Sequence[str] | None = None) -> None:
         if bundle.edited:
             print("deploy.yaml was edited after the export: check it with --check", file=sys.stderr)
         if options.check:
-            _check(bundle)
-        elif options.replay is not None:
-            _replay(bundle, options.replay)
-        elif options.bus:
-            run(bundle, options)
-        else:
+            differences = check_bundle(bundle)
+            print("\n".join(differences or [f"{len(bundle.policies)} policies conform"]))
+            raise SystemExit(bool(differences))
+        if options.replay is not None:
+            count, first = replay(options.replay, bundle)
+            print(f"{count} ticks repeat bit for bit" if first < 0 else f"tick {first} differs")
+            raise SystemExit(first >= 0)
+        if not options.bus:
             raise InputError("--bus, --check or --replay is needed")
+        run(bundle, options)
     except InputError as error:
         print(f"jumper deploy: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
-def _check(bundle: Bundle) -> None:
-    """Print the differences of a bundle from its vectors; exits with 1 if there are any."""
-    differences = check_bundle(bundle)
-    print("\n".join(differences or [f"{len(bundle.policies)} policies conform"]))
-    if differences:
-        raise SystemExit(1)
-
-
-def _replay(bundle: Bundle, folder: Path) -> None:
-    """Print whether the runtime repeats the commands of a log; exits with 1 if not."""
-    ticks, rate = read_log(folder)
-    first = replay(ticks, bundle, rate)
-    print(f"{len(ticks)} ticks repeat bit for bit" if first < 0 else f"tick {first} differs")
-    if first >= 0:
-        raise SystemExit(1)
-
-
-def demo() -> list[tuple[float, Request, tuple[float, float, float]]]:
-    """Return requests that let the robot stand up, walk and jump, with their times [s]."""
-    none = (0.0, 0.0, 0.0)
-    return [
-        (0.5, Request.STAND, none), (0.7, Request.CONFIRM, none), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
-        (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
-    ]  # fmt: skip
+DEMO = (
+    (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
+    (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
+)  # fmt: skip
+"""Requests that let the robot stand up, walk and jump: time [s], request, values."""
 
 
 def run(bundle: Bundle, options: argparse.Namespace) -> None:
     """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
     rate = options.rate or int(bundle.settings["rate"])
-    log = None if options.log is None else Log(options.log, bundle, rate)
+    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
     link = Link(
         open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], lockstep=options.lockstep,
         deadline=0.5 / rate, listener=None if log is None else log.frame,
     )  # fmt: skip
-    runtime = Runtime(bundle, link, rate=rate, dry_run=options.dry_run, listener=None if log is None else log.tick)
-    dog = None if options.no_watchdog or options.lockstep else Watchdog(options.bus, bundle.settings)
-    operator = Script(demo(), rate) if options.demo else Keyboard(options.height, tuple(options.place))
+    source = MotionCapture() if options.capture else None
+    listener = None if log is None else log.tick
+    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run, listener=listener)
+    dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
+    operator = Script(DEMO, rate) if options.demo else Keyboard(options.height, options.place)
     last = State.PASSIVE
 
-    def tick(late: float) -> bool:
+    def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state."""
         nonlocal last
-        command: Command = operator.poll()
-        runtime.tick(*command, late=0.0 if options.lockstep else late)
+        runtime.tick(*operator.poll(), late=late)
         if dog is not None:
             dog.beat()
         if runtime.state != last:
             last = runtime.state
             print(f"{last.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
-        return True
 
     try:
         with raw_terminal():

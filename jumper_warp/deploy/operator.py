@@ -6,48 +6,42 @@ import os
 import select
 import struct
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, ClassVar
 
+from jumper_warp.deploy.policy import JOINTS
 from jumper_warp.deploy.runtime import Request
 
 HELP = """\
 space stop   p motors off   e enable   c confirm (stand up; in Hold: sign test)   h hold
+n next joint (in Hold, on a stand: move it)   z make its present angle zero (motors off)
 w s a d q r  walk: faster ahead, back, left, right, turn left, turn right   x stand still
 j jump up    g jump to the place ahead"""
 STEP = 0.1  # [m/s], [rad/s] of a key
 JOYSTICK = struct.Struct("IhBB")  # time, value, type, number: an event of /dev/input/js0
 BUTTONS = {
-    0: Request.JUMP_UP,
-    1: Request.STOP,
-    2: Request.JUMP_TO,
-    3: Request.WALK,
-    6: Request.STAND,
-    7: Request.CONFIRM,
-}
+    0: Request.JUMP_UP, 1: Request.STOP, 2: Request.JUMP_TO, 3: Request.WALK, 6: Request.STAND, 7: Request.CONFIRM,
+}  # fmt: skip
 AXES = {1: (0, -1.0), 0: (1, -0.5), 3: (2, -1.0)}  # component of the velocity and its value at full deflection
 
-Command = tuple[Request, tuple[float, float, float]]
-NOTHING: Command = (Request.NONE, (0.0, 0.0, 0.0))
+Command = tuple[Request, tuple[float, ...]]  # with up to three values
+NOTHING: Command = (Request.NONE, ())
 
 
 class Keyboard:
     """Requests from keys, and from a gamepad if there is one; `poll` never waits."""
 
     KEYS: ClassVar = {
-        " ": Request.STOP,
-        "p": Request.PASSIVE,
-        "e": Request.STAND,
-        "c": Request.CONFIRM,
-        "h": Request.HOLD,
-    }
+        " ": Request.STOP, "p": Request.PASSIVE, "e": Request.STAND, "c": Request.CONFIRM, "h": Request.HOLD,
+    }  # fmt: skip
     MOVES: ClassVar = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "r": (2, -1)}
 
-    def __init__(self, height: float, place: tuple[float, float], gamepad: str = "/dev/input/js0") -> None:
+    def __init__(self, height: float, place: Sequence[float], gamepad: str = "/dev/input/js0") -> None:
         """Take the height of jumps up [m], the place of others, ahead and left [m], and the gamepad's device."""
         self._jumps = {"j": (Request.JUMP_UP, (height, 0.0, 0.0)), "g": (Request.JUMP_TO, (*place, 0.0))}
         self._velocity = [0.0, 0.0, 0.0]
+        self._joint = -1
         self._pad = None
         with suppress(OSError):
             self._pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)
@@ -65,36 +59,37 @@ class Keyboard:
         """Return the request of a key."""
         if key in self._jumps:
             return self._jumps[key]
+        if key in ("n", "z"):
+            self._joint += key == "n"
+            joint = self._joint % 12
+            print(JOINTS[joint], flush=True)
+            return Request.JOINT if key == "n" else Request.ZERO, (float(joint), 0.0, 0.0)
         if key in self.MOVES:
             axis, sign = self.MOVES[key]
             self._velocity[axis] += sign * STEP
         elif key == "x":
             self._velocity = [0.0, 0.0, 0.0]
         else:
-            return self.KEYS.get(key, Request.NONE), (0.0, 0.0, 0.0)
-        return Request.WALK, self._values()
+            return self.KEYS.get(key, Request.NONE), ()
+        return Request.WALK, tuple(self._velocity)
 
     def event(self, value: int, kind: int, number: int) -> Command:
         """Return the request of a gamepad's event: kind 1 a button, 2 an axis."""
         if kind == 2 and number in AXES:
             axis, full = AXES[number]
             self._velocity[axis] = full * value / 32767
-            return Request.WALK, self._values()
+            return Request.WALK, tuple(self._velocity)
         if kind == 1 and value and number in BUTTONS:
             request = BUTTONS[number]
             key = {Request.JUMP_UP: "j", Request.JUMP_TO: "g"}.get(request)
-            return self._jumps[key] if key else (request, self._values())
+            return self._jumps[key] if key else (request, tuple(self._velocity))
         return NOTHING
-
-    def _values(self) -> tuple[float, float, float]:
-        """Return the commanded velocity."""
-        return self._velocity[0], self._velocity[1], self._velocity[2]
 
 
 class Script:
     """Requests at given ticks, such as of a test."""
 
-    def __init__(self, commands: Iterable[tuple[float, Request, tuple[float, float, float]]], rate: int) -> None:
+    def __init__(self, commands: Iterable[tuple[float, Request, tuple[float, ...]]], rate: int) -> None:
         """Take (time [s], request, values) for a loop of `rate` [Hz]."""
         self._commands = {round(time * rate): (request, values) for time, request, values in commands}
         self._tick = -1

@@ -25,8 +25,8 @@ def request_real_time() -> bool:
     return True
 
 
-def run_loop(tick: Callable[[float], bool], rate: int, seconds: float = float("inf")) -> dict[str, float]:
-    """Call `tick` with its lateness [s] at a rate [Hz] until it returns False or the time is over.
+def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict[str, Any]:
+    """Call `tick` with its lateness [s] at a rate [Hz] until the time is over.
 
     A tick that begins more than a period late drops the periods in between. Returns the statistics of `statistics`.
     """
@@ -46,11 +46,9 @@ def run_loop(tick: Callable[[float], bool], rate: int, seconds: float = float("i
             while (now := time.monotonic()) < due:
                 pass
             lateness = now - due
-            running = tick(lateness)
+            tick(lateness)
             late.append(lateness)
             work.append(time.monotonic() - now)
-            if not running:
-                break
             due += period
             while due + period < time.monotonic():
                 due += period

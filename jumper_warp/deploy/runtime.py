@@ -14,11 +14,12 @@ import numpy as np
 
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import RECEIVED, Link
-from jumper_warp.deploy.codec import ENTER, EXIT
+from jumper_warp.deploy.codec import ENTER, EXIT, ZERO
 from jumper_warp.deploy.control import Gains, clip_target
-from jumper_warp.deploy.motions import BallisticLanding, Ramp, SignTest
+from jumper_warp.deploy.estimator import Estimator, EstimatorCfg
+from jumper_warp.deploy.motions import BallisticLanding, JointTest, Ramp, SignTest
 from jumper_warp.deploy.safety import Fault, Safety
-from jumper_warp.deploy.sensors import ACCEL_SCALE, GYRO_SCALE, MotionCapture, StateSource, unpack_imu
+from jumper_warp.deploy.sensors import UNKNOWN, MotionCapture, unpack_imu
 from jumper_warp.deploy.skills import Jump, Motion, Skill, Walk
 from jumper_warp.utils.errors import InputError
 
@@ -48,10 +49,15 @@ class Request(IntEnum):
     JUMP_UP = 6
     JUMP_TO = 7
     STOP = 8
+    ZERO = 9  # make the present angle of a joint, values[0], its zero; in PASSIVE
+    JOINT = 10  # move a joint, values[0], and compare its reply; in HOLD, on a stand
 
 
 SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to": (State.JUMP_TO, Jump)}
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
+JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
+DRIVERLESS = (State.PASSIVE, State.DAMP, State.LANDING)  # states that a fault does not end
+REST_TICKS = 96  # over which the readings of a robot at rest are averaged
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
 TICK = np.dtype([
     ("received", RECEIVED), ("late", "f4"), ("request", "i1"), ("values", "f4", 3), ("sent", "u1", (12, 8)),
@@ -70,7 +76,7 @@ class Runtime:
         self,
         bundle: Bundle,
         link: Link,
-        source: StateSource | None = None,
+        source: Estimator | MotionCapture | None = None,
         *,
         rate: int = 480,
         dry_run: bool = False,
@@ -78,77 +84,77 @@ class Runtime:
     ) -> None:
         """Start in PASSIVE.
 
-        source: of the base's state; None: a motion capture on the first bus. rate: ticks a second. dry_run: compute
-        commands, and send frames that switch the motors off. listener: called with the record of every tick.
+        source: of the base's state; None: an estimator with the bundle's settings. rate: ticks a second. dry_run:
+        compute commands, and send frames that switch the motors off. listener: called with the record of every tick.
         """
+        settings = bundle.settings
         self.bundle = bundle
         self.link = link
-        self.source = MotionCapture() if source is None else source
+        self.source = Estimator(EstimatorCfg(**settings["estimator"])) if source is None else source
         self.dt = 1.0 / rate
         self.dry_run = dry_run
         self.listener = listener
-        self.safety = Safety(bundle.settings["safety"], bundle.settings["closed_chain"]["transversal_sum"])
-        self.motion = Motion(bundle.settings["switch"])
+        self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
+        self.motion = Motion(settings["switch"])
         self.skills: dict[State, Skill] = {}
         for name, policy in bundle.policies.items():
-            fields = bundle.settings["policies"][name]
+            fields = settings["policies"][name]
             state, kind = SKILLS[fields["skill"]]
             self.skills[state] = kind(policy, Gains.from_yaml(fields), fields["commands"])
-        self.damping = np.array(bundle.settings["safety"]["damping"], dtype=np.float32)
+        self.damping = np.array(settings["safety"]["damping"], dtype=np.float32)
         self.off = np.tile(np.frombuffer(EXIT, np.uint8), (12, 1))
         self.frames = self.off
         self.state = State.PASSIVE
         self.reason = Fault.NONE
+        self.ready = False  # whether all motors and the IMU have sent frames
         self.record = np.zeros((), TICK)
+        self.estimate = UNKNOWN
         self.pending: tuple[State, np.ndarray] | None = None  # jump that waits until walking has come to rest
         self._procedure: Any = None
         self._target = bundle.default.copy()
         self._gains = bundle.hold
+        self._driven = (self._target, 0.0 * self.damping, 0.0 * self.damping)  # target, kp, kd of the next frames
+        self._asked = np.zeros(12)  # [N m] torque that the last frames asked for
         self._contact = np.zeros(4, bool)
-        self._time, self._due = 0, 0
+        self._rest, self._rest_ticks = np.zeros(18), 0  # mean of gyro, accelerometer and angles in PASSIVE
+        self._time, self._due = 0, 0  # of the tick, and of the next policy step
         self._step, self._policy_step = CLOCK // rate, CLOCK // 60
-        self._imu_count, self._started, self._finite = -1, False, True
+        self._imu_count, self._finite = -1, True
 
-    @property
-    def ready(self) -> bool:
-        """Whether all motors and the IMU have sent frames, and the base's state is known."""
-        return self._started
-
-    def tick(self, request: Request = Request.NONE, values: Any = (0.0, 0.0, 0.0), late: float = 0.0) -> np.ndarray:
+    def tick(self, request: Request = Request.NONE, values: Any = (), late: float = 0.0) -> np.ndarray:
         """Exchange the frames of a tick, compute the next commands, and return the tick's record (of TICK).
 
-        request, values (3,): of the operator. late: delay of the tick's begin [s].
+        request, values: of the operator, up to three. late: delay of the tick's begin [s].
         """
         record = self.record
         record["sent"] = self.off if self.dry_run else self.frames
         self.link.send(record["sent"])
         record["received"] = self.link.collect()
-        record["late"], record["request"], record["values"] = late, request, values
+        record["late"], record["request"] = late, request
+        record["values"] = [*values, 0.0, 0.0, 0.0][:3]
         self.frames = self._next(record)
+        self._time += self._step
         if self.listener is not None:
             self.listener(record)
         return record
 
     def _next(self, record: np.ndarray) -> np.ndarray:
         """Return the next frames from a record's received frames, request and lateness; fill its other fields."""
-        policy_due = self._time >= self._due
-        self._due += self._policy_step if policy_due else 0
-        self._time += self._step
         self._read(record)
-        request = Request(int(record["request"]))
+        request, values = Request(int(record["request"])), record["values"].astype(float)
+        ends = self._check(record, request)
         if self.state == State.PASSIVE:
-            self._passive(request, record)
-            frames = self.frames
-        elif self._check(record, request) and self.state not in (State.DAMP, State.LANDING):
+            frames = self._passive(request, values)
+        elif ends and self.state not in DRIVERLESS:
             flies = self.state in JUMPS and not self._contact.any()
             self.reason = self.safety.fault
             self._enter(State.LANDING if flies else State.DAMP)
             frames = self._commands()
-        elif self.safety.fault and self.state not in (State.DAMP, State.LANDING):
+        elif self.safety.fault and self.state not in DRIVERLESS:
             frames = self.frames  # the last safe target
         else:
-            self._requests(request, record["values"].astype(float), policy_due)
-            self._act(policy_due)
+            self._requests(request, values)
+            self._act()
             frames = self._commands()
         record["state"], record["target"] = self.state, self._target
         record["fault"], record["fault_ticks"] = self.safety.fault or self.reason, self.safety.ticks
@@ -159,51 +165,54 @@ class Runtime:
         """Decode the received frames and update the state of the base."""
         received = record["received"]
         self.q, self.qd, self.torque, self.temperature, self.error = self.bundle.joints.read(received["motor"])
-        self.gyro, count = unpack_imu(received["sensor"][0].tobytes(), GYRO_SCALE)
-        self.accel, _ = unpack_imu(received["sensor"][1].tobytes(), ACCEL_SCALE)
+        self.gyro, self.accel, count = unpack_imu(received["sensor"][:2])
         self.stale = not received["sensor_fresh"][:2].all() or count == self._imu_count
         self._imu_count = count
-        if isinstance(self.source, MotionCapture) and received["sensor_fresh"][2:].all():
-            self.source.receive(received["sensor"][2:])
-        if not self._started and received["motor_fresh"].all() and not self.stale:
-            self.source.reset(self.gyro, self.accel, self.q, None)
-            self._started = True
-        self.estimate = self.source.update(self.gyro, self.accel, self.q, self.qd, self.torque, self.dt)
+        self.ready |= bool(received["motor_fresh"].all() and not self.stale)
+        if self.ready and self.state == State.PASSIVE:
+            self._rest_ticks = min(self._rest_ticks + 1, REST_TICKS)
+            self._rest += (np.concatenate([self.gyro, self.accel, self.q]) - self._rest) / self._rest_ticks
+            self.source.reset(self._rest[:3], self._rest[3:6], self._rest[6:])
+        if self.ready:
+            if received["sensor_fresh"][2:].all():
+                self.source.receive(received["sensor"][2:])
+            self.estimate = self.source.update(self.gyro, self.accel, self.q, self.qd, self.torque, self.dt)
         if not self.estimate.diverged:
             self._contact = self.estimate.contact
-        for name in ("angle", "rate", "torque", "position", "velocity", "quaternion", "contact"):
-            values = {"angle": self.q, "rate": self.qd, "torque": self.torque}.get(name)
-            record[name] = getattr(self.estimate, name) if values is None else values
+        record["angle"], record["rate"], record["torque"] = self.q, self.qd, self.torque
+        for name in ("position", "velocity", "quaternion", "contact"):
+            record[name] = getattr(self.estimate, name)
 
     def _check(self, record: np.ndarray, request: Request) -> bool:
         """Check the tick for faults, and return whether the policy must end."""
         self.motion.update(self.estimate, self.gyro, self.q, self.qd)
         flies = not self._contact.any() and self.state in JUMPS
-        upright = self.state in (State.STAND_UP, State.PASSIVE) or flies
-        tilt = 0.0 if upright else float(np.arccos(np.clip(-self.motion.gravity[2], -1.0, 1.0)))
-        sign = self.state == State.HOLD and isinstance(self._procedure, SignTest) and self._procedure.failed
-        ends = self.safety.check(
-            record["received"], self.q, self.qd, self.torque, self._gains.limit, self.temperature, self.error,
-            tilt=tilt, stale=self.stale, diverged=bool(self.estimate.diverged), finite=self._finite,
-            late=float(record["late"]), stop=request == Request.STOP,
+        lies = self.state in (State.STAND_UP, State.PASSIVE)
+        tilt = 0.0 if lies or flies else float(np.arccos(np.clip(-self.motion.gravity[2], -1.0, 1.0)))
+        limit = np.maximum(self._gains.limit, np.abs(self._asked))
+        target, kp, kd = self._driven
+        self._asked = kp * (target - self.q) - kd * self.qd
+        return self.safety.check(
+            record["received"], self.q, self.qd, self.torque, limit, self.temperature, self.error, tilt=tilt,
+            stale=self.stale, diverged=bool(self.estimate.diverged), finite=self._finite, late=float(record["late"]),
+            stop=request == Request.STOP, sign=getattr(self._procedure, "failed", False),
         )  # fmt: skip
-        if sign and not ends:
-            self.safety.fault, ends = Fault.SIGN, True
-        return ends
 
-    def _passive(self, request: Request, record: np.ndarray) -> None:
-        """Keep the motors off until the operator enables them; then switch them to MIT mode."""
-        self.frames = self.off
-        if request == Request.STAND and self._started:
-            self._check(record, request)
-            if self.safety.fault:
-                self.reason = self.safety.fault
-                return
-            self.reason = Fault.NONE
-            self._enter(State.STAND_UP)
-            self.frames = np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
+    def _passive(self, request: Request, values: np.ndarray) -> np.ndarray:
+        """Return frames that keep the motors off until the operator enables them; then those of MIT mode."""
+        if request == Request.ZERO:
+            frames = self.off.copy()
+            frames[self.bundle.joints.motor[int(values[0])]] = np.frombuffer(ZERO, np.uint8)
+            self._rest_ticks = 0
+            return frames
+        if request == Request.STAND and self.ready:
+            self.reason = self.safety.fault
+            if not self.reason:
+                self._enter(State.STAND_UP)
+                return np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
+        return self.off
 
-    def _requests(self, request: Request, values: np.ndarray, policy_due: bool) -> None:
+    def _requests(self, request: Request, values: np.ndarray) -> None:
         """Change the state as the operator requests, or as a skill has ended."""
         state = self.state
         if request == Request.PASSIVE and state in (State.DAMP, State.STAND_UP):
@@ -219,17 +228,18 @@ class Runtime:
             self._enter(State.HOLD)
         elif request == Request.CONFIRM and state == State.HOLD:
             self._procedure = SignTest(self.bundle.default, self.dt)
+        elif request == Request.JOINT and state == State.HOLD:
+            self._procedure = JointTest(self.bundle.default, int(values[0]), self.dt)
         elif request == Request.WALK and state == State.WALK:
             self.skill.wanted = np.clip(values, self.skill.lowest, self.skill.highest)
         elif request == Request.WALK and state == State.HOLD and State.WALK in self.skills:
             self._enter(State.WALK, values)
-        elif request in (Request.JUMP_UP, Request.JUMP_TO) and state in (State.WALK, State.HOLD):
-            wanted = State.JUMP_UP if request == Request.JUMP_UP else State.JUMP_TO
-            if wanted in self.skills:
-                self.pending = (wanted, values)
-        if self.pending is not None and policy_due and (state == State.HOLD or self.skill.ready_to_jump(self.motion)):
-            wanted, values = self.pending
-            self._enter(wanted, values)
+        elif request in JUMP_OF_REQUEST and state in (State.WALK, State.HOLD):
+            if JUMP_OF_REQUEST[request] in self.skills:
+                self.pending = (JUMP_OF_REQUEST[request], values)
+        if self.pending is not None and self._time >= self._due:
+            if state == State.HOLD or self.skill.ready_to_jump(self.motion):
+                self._enter(*self.pending)
 
     @property
     def skill(self) -> Any:
@@ -242,26 +252,23 @@ class Runtime:
         self._procedure = None
         self._finite = True
         self.state = state
+        self._gains = self.bundle.hold
         if state in self.skills:
-            skill = self.skill
-            skill.begin(np.clip(np.array(values, dtype=float), skill.lowest, skill.highest), self.motion)
+            self.skill.begin(np.clip(values, self.skill.lowest, self.skill.highest), self.motion)
             self._gains = self.skill.gains
-            self._due = self._time - self._step  # the policy acts in this tick
-        else:
-            self._gains = self.bundle.hold
+            self._due = self._time  # the policy acts in this tick
         if state == State.HOLD:
             self._procedure = Ramp(self._target, [self.bundle.default], 0.5, self.dt)
         if state == State.LANDING:
             self._target = self.bundle.default
             self._procedure = BallisticLanding(self.dt)
 
-    def _act(self, policy_due: bool) -> None:
+    def _act(self) -> None:
         """Update the targets: of the skill in its policy steps, else of a procedure."""
         if self.state in self.skills:
-            if not policy_due and self._due != self._time - self._step:
+            if self._time < self._due:
                 return
-            if self._due == self._time - self._step:
-                self._due += self._policy_step
+            self._due += self._policy_step
             try:
                 target = self.skill.targets(self.motion)
                 self._finite = bool(np.isfinite(target).all())
@@ -271,23 +278,23 @@ class Runtime:
             if self.skill.done:
                 back = State.WALK if State.WALK in self.skills and self.state != State.WALK else State.HOLD
                 self._enter(back)
-                self._act(policy_due)
+                self._act()
+        elif isinstance(self._procedure, BallisticLanding):
+            loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]
+            blind = bool(self.estimate.diverged) or (self.stale and not isinstance(self.source, MotionCapture))
+            if self._procedure.step(bool(loaded if blind else self._contact.any()), blind):
+                self._enter(State.DAMP)
         elif self._procedure is not None:
-            if isinstance(self._procedure, BallisticLanding):
-                loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]
-                blind = self.estimate.diverged or (self.stale and not isinstance(self.source, MotionCapture))
-                if self._procedure.step(bool(loaded if blind else self._contact.any()), blind):
-                    self._enter(State.DAMP)
-                return
             self._target = self._procedure.step(self.motion)
 
     def _commands(self) -> np.ndarray:
         """Return the frames of the present targets, within the torque limits of the joints at the next tick."""
-        zero = np.zeros(12, np.float32)
         if self.state == State.PASSIVE:
             return self.off
         if self.state == State.DAMP or (self.state == State.STAND_UP and self._procedure is None):
-            return self.bundle.joints.frames(self.q, zero, self.damping)
-        expected = self.q + np.float32(self.dt) * self.qd
-        target = clip_target(self._target, expected, self.qd, self._gains)
-        return self.bundle.joints.frames(target, self._gains.kp, self._gains.kd)
+            self._driven = (self.q, 0.0 * self.damping, self.damping)
+        else:
+            expected = self.q + np.float32(self.dt) * self.qd
+            target = clip_target(self._target, expected, self.qd, self._gains)
+            self._driven = (target, self._gains.kp, self._gains.kd)
+        return self.bundle.joints.frames(*self._driven)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost frame of a motor or of the IMU
-STRAINED_TICKS = 12  # Ticks beyond its torque limit that a motor may need in a landing
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
@@ -27,7 +26,7 @@ class Fault(IntEnum):
     WRONG_ID = 4  # a frame of another id scheme
     MOTOR_ERROR = 5  # a motor reports an error
     TEMPERATURE = 6
-    TORQUE = 7  # a motor exceeds its torque limit
+    TORQUE = 7  # a motor exceeds its torque limit, and the torque of its command
     SPEED = 8
     POSITION = 9
     TILT = 10
@@ -36,12 +35,12 @@ class Fault(IntEnum):
     NOT_FINITE = 13  # the policy's action or observation is not finite
     LATE = 14
     STOP = 15  # the operator's stop
-    SIGN = 16  # a leg does not move the base as it should
+    SIGN = 16  # a joint or a leg does not move as it should
 
 
 ACTING = {
-    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.TORQUE, Fault.SPEED, Fault.POSITION, Fault.TILT,
-    Fault.STOP, Fault.SIGN,
+    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.SPEED, Fault.POSITION, Fault.TILT, Fault.STOP,
+    Fault.SIGN,
 }  # fmt: skip
 """Faults that end the policy at once."""
 
@@ -57,25 +56,24 @@ class Safety:
         self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
         self._sum = np.radians(transversal_sum) + [-margin, margin]
         self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
-        self._strained = np.zeros(12, int)  # ticks for which each motor has exceeded its torque limit
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted
 
     def check(
         self, received: np.ndarray, q: np.ndarray, qd: np.ndarray, torque: np.ndarray, limit: np.ndarray,
         temperature: np.ndarray, error: np.ndarray, *, tilt: float, stale: bool, diverged: bool, finite: bool,
-        late: float, stop: bool,
+        late: float, stop: bool, sign: bool,
     ) -> bool:  # fmt: skip
         """Update `fault` and `ticks`, and return whether the policy must end.
 
         received: record of the tick's frames. q, qd, torque, limit: (12,) [rad], [rad/s], [N m]. temperature [°C],
-        error: (12,). tilt: angle from upright [rad], 0 in flight. late: delay of the tick [s].
+        error: (12,). tilt: angle from upright [rad], 0 in flight. late: delay of the tick [s]. sign: whether a test of
+        signs has failed.
         """
         limits = self._limits
         self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
         age = int(self._ages.max())
-        strained = np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]
-        self._strained = np.where(strained, self._strained + 1, 0)
+        strained = (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()
         sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
         beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
         found = (
@@ -89,7 +87,8 @@ class Safety:
             (Fault.BUS_OFF, received["bus_off"].any()),
             (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),
             (Fault.SILENT, self._ages[:12].max() > 1),
-            (Fault.TORQUE, self._strained.max() >= STRAINED_TICKS),
+            (Fault.SIGN, sign),
+            (Fault.TORQUE, strained),
             (Fault.STALE, self._ages[12] > 1),
             (Fault.DIVERGED, diverged),
             (Fault.NOT_FINITE, not finite),

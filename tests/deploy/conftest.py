@@ -7,6 +7,7 @@ from jumper_warp.bench.bus_sim import BusSim, make_simulation
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.policies.policy import load_policy
 
 POLICIES = ("vertical_jump", "horizontal_jump", "walking_flat")
@@ -56,10 +57,9 @@ def make_robot(bundle, simulation, tmp_path):
     """Function that makes a robot on simulated buses; arguments: of BusSim and Runtime."""
     robots = []
 
-    def make(faults=None, **options):
-        buses = open_buses(f"unix:{tmp_path}", "robot")
-        far = BusSim(buses, faults, simulation=simulation)
-        far.restart()
+    def make(faults=None, source=None, **options):
+        far = BusSim(open_buses(f"unix:{tmp_path}", "robot"), faults, sim=simulation)
+        options["source"] = MotionCapture() if source is None else source
         robots.append(Robot(bundle, tmp_path, far, **options))
         return robots[-1]
 

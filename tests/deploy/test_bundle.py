@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 
 from jumper_warp.bench.vectors import record_vectors
 from jumper_warp.deploy.bundle import FILE, Bundle
-from jumper_warp.deploy.check import check_bundle, check_folder
+from jumper_warp.deploy.check import check_bundle
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.errors import InputError
@@ -85,8 +85,9 @@ def test_mistake_in_the_settings_fails_the_check(change, bundle_folder, tmp_path
     settings = yaml.safe_load((folder / FILE).read_text())
     change(settings)
     (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
-    assert check_folder(folder)
-    assert Bundle(folder).edited
+    bundle = Bundle(folder)
+    assert check_bundle(bundle)
+    assert bundle.edited
 
 
 def test_stale_history_fails_the_check(bundle_folder, monkeypatch):

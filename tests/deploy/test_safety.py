@@ -57,22 +57,22 @@ def over_temperature(robot):
 
 def motor_error(robot):
     """Let a motor report over-current."""
-    robot.far.error_code[3] = 2
+    robot.far.faults.error_code = 2
 
 
 def torque(robot):
     """Let a motor report 25 N m."""
-    robot.far.torque_bias[5] = 25.0
+    robot.far.bias[2, 5] = 25.0
 
 
 def speed(robot):
     """Let a motor report 50 rad/s."""
-    robot.far.speed_bias[5] = 50.0
+    robot.far.bias[1, 5] = 50.0
 
 
 def position(robot):
     """Let a motor report an angle beyond its stop."""
-    robot.far.position_bias[6] = 3.0
+    robot.far.bias[0, 6] = 3.0
 
 
 def tilt(robot):
@@ -116,7 +116,7 @@ FAULTS = {
     "error frames": (error_frames, Fault.ERROR_FRAME, 5, {}),
     "over-temperature": (over_temperature, Fault.TEMPERATURE, 1, {}),
     "motor error": (motor_error, Fault.MOTOR_ERROR, 1, {}),
-    "torque": (torque, Fault.TORQUE, 12, {}),
+    "torque": (torque, Fault.TORQUE, 5, {}),
     "speed": (speed, Fault.SPEED, 1, {}),
     "position": (position, Fault.POSITION, 1, {}),
     "tilt": (tilt, Fault.TILT, 2, {}),  # the state is a tick old
@@ -148,7 +148,7 @@ def test_fault_ends_in_damping(name, make_robot):
     faulty = [record for record in records[: damped - 1] if record["fault"]]
     assert len(faulty) <= HOLD_TICKS
     if len(faulty) == HOLD_TICKS and name not in ("NaN of the policy", "stale IMU"):
-        assert (records[2]["sent"] == before).all() or name == "torque"  # the last safe target
+        assert (records[2]["sent"] == before).all()  # the last safe target
     kp = robot.runtime.bundle.joints.codec.decode_command(robot.runtime.frames)[2]
     assert (kp == 0.0).all()
 
@@ -159,7 +159,7 @@ def test_fault_in_flight_ends_in_damping_after_touchdown(name, make_robot):
     robot = make_robot()
     robot.stand()
     robot.run(1, Request.JUMP_UP, (0.8, 0.0, 0.0))
-    while robot.far.contact.any() or robot.far._velocity[2] < 0.5:
+    while robot.far.contact.any() or robot.far.velocity[2] < 0.5:
         robot.run(1)
     inject(robot)
     records = robot.run(360, **arguments)
