@@ -4,7 +4,8 @@
 
 In lockstep: the runtime's frames pass Unix datagrams to `BusSim`. Direct simulation runs the same skills each 1/60 s on
 the true state, with the motors' torque limits. `--drop 0.01` loses frames, `--delay 0.5` delays commands by a tick,
-`--rate 500` changes the motor loop, `--estimator` replaces the motion capture. The script writes `metrics.json`.
+`--rate 500` changes the motor loop. `--estimator` replaces the motion capture by the estimator, with noise and drawn
+biases of the IMU and offsets of the joints. The script writes `metrics.json`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jumper_warp.bench.faults import BusFaults
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.estimator import Estimator
-from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.runtime import REST_TICKS, Request, Runtime, State
 from jumper_warp.deploy.sensors import Estimate, MotionCapture
 from jumper_warp.deploy.skills import Motion, Walk, rotate
 from jumper_warp.policies.policy import load_policy
@@ -35,6 +36,8 @@ from support.scripts import OutputArgs, run_script
 POLICIES = {State.JUMP_UP: "vertical_jump", State.JUMP_TO: "horizontal_jump", State.WALK: "walking_flat"}
 TOLERANCE = 0.1  # [m] of apex and landing
 LOWEST, MOST_TILT = 0.10, np.radians(60.0)  # [m], [rad] height and tilt of a base beyond which it has fallen
+GYRO_NOISE, ACCEL_NOISE = 3.0e-4, 2.0e-3  # [rad/s/√Hz], [m/s^2/√Hz]
+GYRO_BIAS, ACCEL_BIAS, JOINT_OFFSET = 5.0e-3, 0.03, np.radians(0.3)  # [rad/s], [m/s^2], [rad] standard deviations
 COMMAND_SECONDS = 3.0  # [s] for which each random velocity is commanded
 
 
@@ -60,7 +63,9 @@ class Bench:
         export_bundle([(name, load_policy(name)) for name in POLICIES.values()], folder)
         self.args = args
         self.bundle = Bundle(folder)
-        faults = BusFaults(args.drop, delay=args.delay)
+        noise = np.sqrt(args.rate) * np.array([GYRO_NOISE, ACCEL_NOISE] if args.estimator else [0.0, 0.0])
+        faults = BusFaults(args.drop, delay=args.delay, gyro_noise=noise[0], accel_noise=noise[1])
+        self.rng = np.random.default_rng(args.seed + 1)
         self.far = BusSim(open_buses(f"unix:{folder}/bus", "robot"), faults, sim=make_simulation(1.0 / args.rate))
         self.link = Link(open_buses(f"unix:{folder}/bus"), pump=self.far.serve)
         self.direct = {
@@ -72,12 +77,14 @@ class Bench:
     def runtime(self) -> Runtime:
         """Return a runtime whose robot stands in the default pose, with motors on."""
         self.far.restart()
+        if self.args.estimator:
+            self.far.imu_bias = self.rng.normal(0.0, [[GYRO_BIAS], [ACCEL_BIAS]], (2, 3))
+            self.far.bias[0] = self.rng.normal(0.0, JOINT_OFFSET, 12)
         source = Estimator() if self.args.estimator else MotionCapture()
         runtime = Runtime(self.bundle, self.link, source, rate=self.args.rate)
-        runtime.tick()
-        runtime.tick()
-        runtime.tick(Request.STAND)
-        runtime.tick()
+        for request in [Request.NONE] * REST_TICKS + [Request.STAND, Request.NONE]:
+            self.far.restart()  # stand at rest while the motors are off
+            runtime.tick(request)
         return runtime
 
     def over_bus(self, state: State, commands: np.ndarray, steps: int) -> dict[str, np.ndarray]:
@@ -117,6 +124,12 @@ class Bench:
                 rows.append([*sim.joint_q()[0, :7], *sim.base_velocity()[0]])
         return trajectory(rows)
 
+    def heading(self) -> np.ndarray:
+        """Return the quaternion of the robot's true yaw."""
+        ahead = rotate(self.far.q[3:7], np.array([1.0, 0.0, 0.0]))
+        half = 0.5 * np.arctan2(ahead[1], ahead[0])
+        return np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+
     def course(self, values: np.ndarray) -> bool:
         """Run a course over the bus; values: height [m], place (2,) [m], speeds (2,). Return whether it succeeds."""
         runtime = self.runtime()
@@ -132,8 +145,9 @@ class Bench:
             for _ in range(round((12.0 if jumps else 2.0) * self.args.rate)):
                 runtime.tick()
                 if runtime.state in (State.JUMP_UP, State.JUMP_TO):
+                    if not jumped:
+                        place = (self.far.q[:3] + rotate(self.heading(), np.array([*command[:2], 0.0])))[:2]
                     jumped = True
-                    place = runtime.skill.goal
                     apex = max(apex, self.far.q[2])
                 if runtime.state == State.DAMP or (jumped and runtime.state == State.WALK):
                     break

@@ -44,6 +44,7 @@ class BusSim:
         self.zero = np.zeros(12)  # [rad] position of each motor at its zero
         self.silent: set[int] = set()  # motors that do not reply
         self.bias = np.zeros((3, 12))  # added to position [rad], speed [rad/s] and torque [N m] in replies
+        self.imu_bias = np.zeros((2, 3))  # added to angular velocity [rad/s] and specific force [m/s^2]
         self.imu_frozen = False
         self.legs = list(range(LEGS))  # leg at each bus: a permutation swaps cables
         self.count = 0
@@ -126,9 +127,10 @@ class BusSim:
         self.count += not self.imu_frozen
         force = rotate(self.q[3:7], self.acceleration + np.array([0.0, 0.0, EARTH]), inverse=True)
         gyro = rotate(self.q[3:7], self.qd[3:6], inverse=True)
-        noise = self.rng.normal(size=(2, 3)) if self.faults.gyro_noise or self.faults.accel_noise else np.zeros((2, 3))
+        deviations = np.array([[self.faults.gyro_noise], [self.faults.accel_noise]])
+        gyro, force = self.imu_bias + [gyro, force] + deviations * self.rng.normal(size=(2, 3))
         frames = [
-            *pack_imu(gyro + self.faults.gyro_noise * noise[0], force + self.faults.accel_noise * noise[1], self.count),
+            *pack_imu(gyro, force, self.count),
             *pack_capture(self.q[:3], self.velocity, self.q[3:7], self.contact),
         ]
         return [data_frame(number, data) for number, data in zip(SENSOR_IDS, frames, strict=True)]
