@@ -10,13 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import onnx
 import yaml
 
-from jumper_warp.bench.vectors import npz_bytes, vectors_of
+from jumper_warp.bench.vectors import vectors_bytes
 from jumper_warp.deploy.bundle import FILE, VERSION, settings_hash
 from jumper_warp.deploy.codec import dbc
-from jumper_warp.policies.policy import Policy, bundle_onnx
-from jumper_warp.policies.spec import PolicyInterface
+from jumper_warp.deploy.policy import JOINTS
+from jumper_warp.policies.onnx import onnx_bytes
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.spec import PolicyInterface, checksum_entry
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
 from jumper_warp.utils.errors import InputError
@@ -30,7 +33,6 @@ COMMAND_RANGES = {
     "jump_to": {"ahead": [-0.5, 1.5], "left": [-0.5, 0.5]},
 }
 """Ranges of commands by skill, [m/s], [rad/s], [m]; the runtime clips requests to them."""
-WALKING_LIMITS = {"lateral": (-50.0, 110.0), "transversal": (-30.0, 140.0)}  # [deg] hard stops of the joints
 
 
 def skill_of(interface: PolicyInterface) -> str:
@@ -44,30 +46,22 @@ def skill_of(interface: PolicyInterface) -> str:
 def policy_settings(interface: PolicyInterface, file: str) -> dict[str, Any]:
     """Return a policy's section of deploy.yaml, with the keys of unitree's files."""
     skill = skill_of(interface)
+    default = list(interface.default_joint_pos)
+    action = {
+        "clip": [-1.0, 1.0], "joint_names": list(interface.joint_names), "scale": list(interface.action_scale),
+        "offset": default, "joint_ids": None,
+    }  # fmt: skip
+    observations = {
+        name: {
+            "params": {}, "clip": [-term["clip"], term["clip"]], "scale": term["scale"],
+            "history_length": term["history"],
+        } for name, term in interface.observation_layout.items()
+    }  # fmt: skip
     return {
-        "file": file,
-        "task": interface.task,
-        "skill": skill,
-        "step_dt": interface.policy_dt,
-        "stiffness": list(interface.joint_stiffness),
-        "damping": list(interface.joint_damping),
-        "torque_limit": list(interface.torque_limit),
-        "default_joint_pos": list(interface.default_joint_pos),
-        "actions": {
-            "JointPositionAction": {
-                "clip": [-1.0, 1.0],
-                "joint_names": list(interface.joint_names),
-                "scale": list(interface.action_scale),
-                "offset": list(interface.default_joint_pos),
-                "joint_ids": None,
-            }
-        },
-        "observations": {
-            name: {"params": {}, "clip": [-term["clip"], term["clip"]], "scale": term["scale"],
-                   "history_length": term["history"]}
-            for name, term in interface.observation_layout.items()
-        },
-        "commands": COMMAND_RANGES[skill],
+        "file": file, "task": interface.task, "skill": skill, "step_dt": interface.policy_dt,
+        "stiffness": list(interface.joint_stiffness), "damping": list(interface.joint_damping),
+        "torque_limit": list(interface.torque_limit), "default_joint_pos": default,
+        "actions": {"JointPositionAction": action}, "observations": observations, "commands": COMMAND_RANGES[skill],
         "command_filter": interface.command_filter,
     }  # fmt: skip
 
@@ -76,50 +70,55 @@ def robot_settings() -> dict[str, Any]:
     """Return the sections of deploy.yaml that all policies share."""
     description = load_description()
     motors = description.motors
-    joints = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]
-    kinds = ["lateral" if name.endswith("lateral") else "transversal" for name in joints]
-    default = [float(angle) for angle in description.pose("default")]
-    folded = [0.0 if kind == "lateral" else math.radians(100.0) for kind in kinds]
+    lateral = ["lateral" in name for name in JOINTS]
+    curve = {name: [getattr(motor, name) for motor in motors] for name in ("cutoff_speed", "no_load_speed")}
+    curve |= {"peak": [motor.peak_torque for motor in motors]}
     return {
-        "version": VERSION,
-        "step_dt": 1.0 / 60.0,
-        "rate": 480,
-        "joint_names": joints,
-        "joint_ids_map": list(range(12)),
-        "joint_signs": [1] * 12,
-        "joint_offsets": [0.0] * 12,
-        "motors": [motor.type for motor in motors],
-        "can": {"reply_id": 0},
-        "default_joint_pos": default,
+        "version": VERSION, "step_dt": 1.0 / 60.0, "rate": 480, "joint_names": list(JOINTS),
+        "joint_ids_map": list(range(12)), "joint_signs": [1] * 12, "joint_offsets": [0.0] * 12,
+        "motors": [motor.type for motor in motors], "can": {"reply_id": 0},
+        "default_joint_pos": [float(angle) for angle in description.pose("default")],
         "hold": {
-            "stiffness": [motor.jumping.kp for motor in motors],
-            "damping": [motor.jumping.kd for motor in motors],
-            "torque_limit": [10.0 if kind == "lateral" else 18.0 for kind in kinds],
+            "stiffness": [motor.jumping.kp for motor in motors], "damping": [motor.jumping.kd for motor in motors],
+            "torque_limit": [10.0 if each else 18.0 for each in lateral],
         },
-        "stand_up": {"folded": folded, "seconds": 2.0},
-        "torque_curve": {
-            "peak": [motor.peak_torque for motor in motors],
-            "cutoff_speed": [motor.cutoff_speed for motor in motors],
-            "no_load_speed": [motor.no_load_speed for motor in motors],
-            "fade_start": [OVERSPEED_START] * 12,
-            "fade_end": [OVERSPEED_END] * 12,
-        },
+        "stand_up": {"folded": [0.0 if each else math.radians(100.0) for each in lateral], "seconds": 2.0},
+        "torque_curve": curve | {"fade_start": [OVERSPEED_START] * 12, "fade_end": [OVERSPEED_END] * 12},
         "closed_chain": {"transversal_sum": [math.degrees(limit) for limit in description.transversal_sum]},
         "safety": {
-            "lower": [WALKING_LIMITS[kind][0] for kind in kinds],
-            "upper": [WALKING_LIMITS[kind][1] for kind in kinds],
-            "position_margin": 12.0,
-            "max_rate": 45.0,
-            "max_temperature": 80.0,
-            "max_tilt": 60.0,
-            "torque_factor": 1.2,
-            "torque_margin": 2.0,
-            "max_late": 1.0e-3,
-            "damping": [2.0] * 12,
+            "lower": [-50.0 if each else -30.0 for each in lateral],
+            "upper": [110.0 if each else 140.0 for each in lateral],
+            "position_margin": 12.0, "max_rate": 45.0, "max_temperature": 80.0, "max_tilt": 60.0, "torque_factor": 1.2,
+            "torque_margin": 2.0, "max_late": 1.0e-3, "damping": [2.0] * 12,
         },
         "switch": {"rest_speed": 0.10, "rest_spin": 0.30, "rest_tilt": 0.14, "max_offset": 0.44},
         "estimator": {},
-    }
+    }  # fmt: skip
+
+
+def reader_metadata(interface: PolicyInterface) -> dict[str, str]:
+    """Return the entries of ONNX metadata that readers of mjlab's and BeyondMimic's policies take.
+
+    `observation_names` are terms there. The entries `observation_terms_*` have a value for each term, in this order.
+    A reader stacks `observation_terms_history_length` frames of a term, the oldest first, and flattens them.
+    """
+    layout = interface.observation_layout
+    entries: dict[str, list] = {
+        "command_names": [name for name in layout if name in SKILL_OF_COMMAND], "observation_names": list(layout),
+        "observation_terms_history_length": [term["history"] for term in layout.values()],
+        "observation_terms_flatten_history_dim": [1] * len(layout),
+    }  # fmt: skip
+    entries |= {f"observation_terms_{key}": [term[key] for term in layout.values()] for key in ("scale", "clip")}
+    return {name: ",".join(map(str, values)) for name, values in entries.items()}
+
+
+def bundle_onnx(policy: Policy) -> bytes:
+    """Return a policy as an ONNX file with its checksum, and metadata that other readers take."""
+    model = onnx.load_from_string(onnx_bytes(policy.tensors(), policy.interface, policy.config))
+    entries = {entry.key: entry.value for entry in model.metadata_props}
+    onnx.helper.set_model_props(model, entries | reader_metadata(policy.interface))
+    data = model.SerializeToString(deterministic=True)
+    return data + checksum_entry(data)
 
 
 def runtime_archive() -> bytes:
@@ -151,20 +150,15 @@ def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
         if section["skill"] in {each["skill"] for each in sections.values()}:
             raise InputError(f"{name}: the bundle already has a policy for {section['skill']}")
         sections[name] = section
-        files[f"{name}.onnx"] = bundle_onnx(policy, SKILL_OF_COMMAND)
-        files[f"{name}.npz"] = npz_bytes(vectors_of(name, policy))
+        files[f"{name}.onnx"] = bundle_onnx(policy)
+        files[f"{name}.npz"] = vectors_bytes(name, policy)
     files["jumper.dbc"] = dbc(settings["motors"][:3]).encode()
     files["deploy.pyz"] = runtime_archive()
     settings["policies"] = sections
-    return write_bundle(settings, files, folder)
-
-
-def write_bundle(settings: dict[str, Any], files: dict[str, bytes], folder: Path) -> Path:
-    """Write files by name, and deploy.yaml with their hashes; return the folder."""
-    settings = settings | {"files": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
+    settings["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     settings["sha256"] = settings_hash(settings)
     folder.mkdir(parents=True, exist_ok=True)
+    files[FILE] = yaml.safe_dump(settings, sort_keys=False).encode()
     for name, data in files.items():
         write_atomically(folder / name, data)
-    write_atomically(folder / FILE, yaml.safe_dump(settings, sort_keys=False).encode())
     return folder

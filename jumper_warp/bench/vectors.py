@@ -6,10 +6,7 @@ network. Readings are the newest frames of the observations.
 
 from __future__ import annotations
 
-import base64
 import io
-import json
-import zlib
 
 import numpy as np
 
@@ -61,12 +58,10 @@ def record_vectors(policy: Policy, episodes: int = EPISODES, steps: int = STEPS)
             rows[name].append(value)
     arrays = {name: np.array(values) for name, values in rows.items()}
     vectors = _frames(arrays, policy)
-    vectors |= {name: arrays[name].astype(np.float32) for name in arrays if name.startswith("reading_")}
-    vectors["observation"] = arrays["observation"][::OBSERVATION_EVERY].astype(np.float32)
-    vectors |= {name: arrays[name].astype(np.float32) for name in ("action", "target")}
-    vectors["reset"] = arrays["reset"]
-    vectors["observation_every"] = np.array(OBSERVATION_EVERY)
-    return vectors
+    arrays["observation"] = arrays["observation"][::OBSERVATION_EVERY]
+    names = [f"reading_{name}" for name in names] + ["observation", "action", "target"]
+    vectors |= {name: arrays[name].astype(np.float32) for name in names}
+    return vectors | {"reset": arrays["reset"], "observation_every": np.array(OBSERVATION_EVERY)}
 
 
 def _frames(arrays: dict[str, np.ndarray], policy: Policy) -> dict[str, np.ndarray]:
@@ -91,32 +86,11 @@ def _frames(arrays: dict[str, np.ndarray], policy: Policy) -> dict[str, np.ndarr
     }  # fmt: skip
 
 
-def vectors_of(name: str, policy: Policy) -> dict[str, np.ndarray]:
-    """Return the vectors of a policy: those of the project's policy of this name, else recorded ones."""
-    shipped = (ASSETS / "conformance") / f"{name}.npz"
-    if not shipped.is_file():
-        return record_vectors(policy)
-    with np.load(shipped, allow_pickle=False) as file:
-        return {key: file[key] for key in file.files}
-
-
-def npz_bytes(vectors: dict[str, np.ndarray]) -> bytes:
-    """Return vectors as a compressed npz file."""
+def vectors_bytes(name: str, policy: Policy) -> bytes:
+    """Return the vectors of a policy as an npz file: those of the project's policy of this name, else recorded ones."""
+    shipped = ASSETS / "conformance" / f"{name}.npz"
+    if shipped.is_file():
+        return shipped.read_bytes()
     file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **vectors)
+    np.savez_compressed(file, allow_pickle=False, **record_vectors(policy))
     return file.getvalue()
-
-
-def json_text(vectors: dict[str, np.ndarray]) -> str:
-    """Return vectors as JSON: each array with dtype, shape and its bytes, compressed by zlib, in base64.
-
-    Bytes are little-endian, the last index fastest; texts are lists.
-    """
-    content = {}
-    for name, array in vectors.items():
-        if array.dtype.kind == "U":
-            content[name] = array.tolist()
-        else:
-            data = base64.b64encode(zlib.compress(np.ascontiguousarray(array).tobytes(), 9)).decode()
-            content[name] = {"dtype": str(array.dtype), "shape": list(array.shape), "zlib_base64": data}
-    return json.dumps(content) + "\n"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -79,15 +79,12 @@ def _repeated_block(weight: np.ndarray) -> np.ndarray | None:
 
 
 def onnx_model(
-    tensors: Mapping[str, torch.Tensor],
-    interface: PolicyInterface,
-    config: Mapping[str, Any],
-    extra: Mapping[str, str] | None = None,
+    tensors: Mapping[str, torch.Tensor], interface: PolicyInterface, config: Mapping[str, Any]
 ) -> onnx.ModelProto:
     """Return the ONNX model of a policy: `obs` (batch, num_obs) to `actions` (batch, num_actions), clipped to ±1.
 
     It computes the same as `Policy.act`. tensors: of normaliser and layers, see `Policy.tensors`. config: configuration
-    with the commit for the metadata. extra: metadata that replaces or adds entries.
+    with the commit for the metadata.
     """
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     graph = _GraphBuilder()
@@ -119,7 +116,7 @@ def onnx_model(
     model = helper.make_model(
         network, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="jumper-warp"
     )
-    helper.set_model_props(model, metadata(interface, config) | dict(extra or {}))
+    helper.set_model_props(model, metadata(interface, config))
     return model
 
 
@@ -138,33 +135,9 @@ def metadata(interface: PolicyInterface, config: Mapping[str, Any]) -> dict[str,
     return entries | {"jumper_warp": json.dumps(full, ensure_ascii=False, allow_nan=False)}
 
 
-def reader_metadata(interface: PolicyInterface, command_terms: Collection[str]) -> dict[str, str]:
-    """Return the entries of ONNX metadata that readers of mjlab's and BeyondMimic's policies take.
-
-    `observation_names` are terms there. The entries `observation_terms_*` have a value for each term, in this order.
-    A reader stacks `observation_terms_history_length` frames of a term, the oldest first, and flattens them.
-    command_terms: names of terms that hold a command.
-    """
-    layout = interface.observation_layout
-    entries = {
-        "command_names": [name for name in layout if name in command_terms],
-        "observation_names": list(layout),
-        "observation_terms_scale": [term["scale"] for term in layout.values()],
-        "observation_terms_clip": [term["clip"] for term in layout.values()],
-        "observation_terms_history_length": [term["history"] for term in layout.values()],
-        "observation_terms_flatten_history_dim": [1] * len(layout),
-    }
-    return {name: ",".join(map(str, values)) for name, values in entries.items()}
-
-
-def onnx_bytes(
-    tensors: Mapping[str, torch.Tensor],
-    interface: PolicyInterface,
-    config: Mapping[str, Any],
-    extra: Mapping[str, str] | None = None,
-) -> bytes:
+def onnx_bytes(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface, config: Mapping[str, Any]) -> bytes:
     """Return a policy as the bytes of an ONNX file, validated and deterministic; arguments: see `onnx_model`."""
-    model = onnx_model(tensors, interface, config, extra)
+    model = onnx_model(tensors, interface, config)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 

@@ -9,7 +9,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
@@ -36,7 +36,7 @@ from jumper_warp.policies.catalog import (
     run_folder,
     write_files,
 )
-from jumper_warp.policies.onnx import check_tensors, onnx_bytes, reader_metadata, tensors_from_onnx
+from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_onnx
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, checksum_entry, make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import checkpoint as checkpoints
@@ -401,16 +401,6 @@ def export_onnx(policy: Policy, path: Path) -> Path:
 
 
 # ---------------------------------------------------------------------- further training
-
-
-def bundle_onnx(policy: Policy, command_terms: Collection[str]) -> bytes:
-    """Return a policy as an ONNX file for deployment: with its checksum, and metadata that other readers take.
-
-    command_terms: names of observation terms that hold a command.
-    """
-    extra = reader_metadata(policy.interface, command_terms)
-    data = onnx_bytes(policy.tensors(), policy.interface, policy.config, extra)
-    return data + checksum_entry(data)
 
 
 def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
