@@ -79,7 +79,7 @@ class BusSim:
         """
         late, self._late = self._late, []
         for motor, data in late:
-            self._take(motor, data)
+            self.take(motor, data)
         answers: list[list[can.Message]] = [[] for _ in range(LEGS)]
         for number, bus in enumerate(self.buses):
             while (message := bus.recv(LOCKSTEP_TIMEOUT)) is not None and message.arbitration_id != SYNC:
@@ -104,7 +104,7 @@ class BusSim:
         if self.faults.delay and self.rng.random() < self.faults.delay:
             self._late.append((motor, data))
         else:
-            self._take(motor, data)
+            self.take(motor, data)
         if self._replies is None:
             position, velocity, torque = self.bias + [self.angle - self.zero, self.rate, self.torque]
             error = np.array([self.faults.error_code] + 11 * [0])
@@ -112,7 +112,7 @@ class BusSim:
             self._replies = self.codec.encode_reply(np.tile([1, 2, 3], LEGS), reply)
         return [data_frame(own_id if self.faults.motor_own_id else HOST_ID, self._replies[motor].tobytes())]
 
-    def _take(self, motor: int, data: bytes) -> None:
+    def take(self, motor: int, data: bytes) -> None:
         """Store a motor's command, or switch it."""
         if data in (ENTER, EXIT):
             self.enabled[motor] = data == ENTER

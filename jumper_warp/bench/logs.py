@@ -9,14 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-from jumper_warp.bench.bus_sim import make_simulation
-from jumper_warp.deploy.codec import ENTER, EXIT, Codec
+from jumper_warp.bench.bus_sim import BusSim, make_simulation
 from jumper_warp.deploy.log import read_log
 from jumper_warp.deploy.runtime import State
 from jumper_warp.evaluation.commands import open_viewer
 from jumper_warp.evaluation.recorder import ankles, save_recording
 from jumper_warp.identification.motions import RecordedMotion
-from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
@@ -24,6 +22,7 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.viz.recorder import Recorder
 
 LEAST_SECONDS = 0.5  # [s] of a motion
+MOTORS = [7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]  # columns of the motors in joint coordinates
 DRIVEN = (State.STAND_UP, State.HOLD, State.WALK, State.JUMP_UP, State.JUMP_TO)  # states with position control
 
 
@@ -41,20 +40,14 @@ def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMot
         if state[first] < 0 or end - first < LEAST_SECONDS * rate:
             continue
         part = ticks[first + 1 : end]
-        motions.append(
-            RecordedMotion(
-                f"{folder.name}_{State(int(state[first])).name.lower()}_{first}",
-                time=np.arange(len(part)) / rate,
-                target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
-                angle=part["angle"].astype(float),
-                rate=part["rate"].astype(float),
-                torque=part["torque"].astype(float),
-                position=part["position"].astype(float),
-                quaternion=part["quaternion"].astype(float),
-                gains="walking" if state[first] == State.WALK else "jumping",
-                torque_limit=torque_limit,
-            )
-        )
+        names = ("angle", "rate", "torque", "position", "quaternion")
+        motion = RecordedMotion(
+            f"{folder.name}_{State(int(state[first])).name.lower()}_{first}", time=np.arange(len(part)) / rate,
+            target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
+            **{name: part[name].astype(float) for name in names}, torque_limit=torque_limit,
+            gains="walking" if state[first] == State.WALK else "jumping",
+        )  # fmt: skip
+        motions.append(motion)
     if not motions:
         raise InputError(f"{folder}: no {LEAST_SECONDS} s in one state with position control")
     return motions
@@ -72,27 +65,16 @@ class LogCfg:
 
 def simulated_again(ticks: np.ndarray, rate: int) -> np.ndarray:
     """Return the joint coordinates (ticks, 43) of a simulation that gets a log's commands from its first pose on."""
-    sim = make_simulation(1.0 / rate)
-    codec = Codec([motor.type for motor in load_description().motors])
-    q = sim.joint_q()[0].copy()
-    q[:3], q[3:7] = ticks["position"][0], ticks["quaternion"][0]
-    q[_motor_columns()] = ticks["angle"][0]
-    sim.state.joint_q.assign(q)
+    far = BusSim([], sim=make_simulation(1.0 / rate))
+    q = far.sim.joint_q()[0]
+    q[:3], q[3:7], q[MOTORS] = ticks["position"][0], ticks["quaternion"][0], ticks["angle"][0]
     result = np.empty((len(ticks), len(q)), np.float32)
     for number, frames in enumerate(ticks["sent"]):
-        target, _, kp, kd, _ = codec.decode_command(frames)
-        switched = np.array([frame.tobytes() in (ENTER, EXIT) for frame in frames])
-        sim.motors.kp.assign(np.where(switched, 0.0, kp)[:, None].astype(np.float32))
-        sim.motors.kd.assign(np.where(switched, 0.0, kd)[:, None].astype(np.float32))
-        sim.set_targets(np.where(switched, 0.0, target))
-        result[number] = sim.joint_q()[0]
-        sim.step()
+        for motor, frame in enumerate(frames):
+            far.take(motor, frame.tobytes())
+        result[number] = q
+        far.advance()
     return result
-
-
-def _motor_columns() -> list[int]:
-    """Return the columns of the motors in joint coordinates."""
-    return [7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]
 
 
 def play_log(cfg: LogCfg) -> Path:
@@ -108,13 +90,13 @@ def play_log(cfg: LogCfg) -> Path:
     for number in range(0, len(ticks), max(1, rate // 60)):
         q = np.tile(simulated[number], (2, 1))
         q[0, :3], q[0, 3:7] = ticks["position"][number], ticks["quaternion"][number]
-        q[0, _motor_columns()] = ticks["angle"][number]
+        q[0, MOTORS] = ticks["angle"][number]
         sim.state.joint_q.assign(q.ravel())
         poses = sim.links()[0]
         series = {"height/log [m]": float(q[0, 2]), "height/simulation [m]": float(q[1, 2])}
         recorder.record(number / rate, poses.reshape(-1, 7), series, ankles(poses), np.zeros((2, 4, 3)))
     path = save_recording(recorder.recording(), output_dir("play", cfg.out), "log")
-    error = np.sqrt(np.mean((simulated[:, _motor_columns()] - ticks["angle"]) ** 2))
+    error = np.sqrt(np.mean((simulated[:, MOTORS] - ticks["angle"]) ** 2))
     print(f"{len(ticks) / rate:.1f} s, RMS difference of joint angles {error:.4f} rad")
     print(path)
     open_viewer(path, cfg.viewer)

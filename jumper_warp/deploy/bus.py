@@ -45,13 +45,12 @@ class UnixBus(can.BusABC):
         """Bind a socket to the path `local` (None: only send), and send to the path `peer`."""
         super().__init__(channel=str(peer))
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._peer = str(peer)
-        self._local = local
+        self._peer, self._local = str(peer), local
         if local is not None:
             local.unlink(missing_ok=True)
             self._socket.bind(str(local))
         self._socket.setblocking(False)
-        self.channel_info = f"unix {peer}"
+        self.fileno = self._socket.fileno
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame at once. Raises CanOperationError: the queue is full, or nobody has bound the peer."""
@@ -62,18 +61,13 @@ class UnixBus(can.BusABC):
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next frame, or None after `timeout` [s]."""
+        if timeout != 0.0 and not select.select([self._socket], [], [], timeout)[0]:
+            return None
         try:
-            packet = self._socket.recv(_FRAME.size)
+            number, length, error, data = _FRAME.unpack(self._socket.recv(_FRAME.size))
         except BlockingIOError:
-            if timeout == 0.0 or not select.select([self._socket], [], [], timeout)[0]:
-                return None
-            packet = self._socket.recv(_FRAME.size)
-        number, length, error, data = _FRAME.unpack(packet)
+            return None
         return can.Message(arbitration_id=number, data=data[:length], is_error_frame=bool(error), is_extended_id=False)
-
-    def fileno(self) -> int:
-        """Return the socket's file descriptor."""
-        return self._socket.fileno()
 
     def shutdown(self) -> None:
         """Close the socket and remove its path."""
@@ -92,20 +86,16 @@ def open_buses(spec: str, side: str = "host") -> list[can.BusABC]:
     """
     kind, _, channel = spec.partition(":")
     try:
-        if kind == "socketcan":
-            names = channel.split(",")
-            if len(names) != LEGS:
-                raise InputError(f"{spec}: four interfaces are needed, one a leg: FL, FR, BL, BR")
-            return [can.Bus(interface="socketcan", channel=name) for name in names]
+        if kind == "socketcan" and channel.count(",") == LEGS - 1:
+            return [can.Bus(interface="socketcan", channel=name) for name in channel.split(",")]
         if kind == "udp_multicast":
-            ports = range(int(channel or 43113), int(channel or 43113) + LEGS)  # one port a bus: groups cross-talk
+            ports = range(int(channel), int(channel) + LEGS)  # one port a bus: groups cross-talk
             return [can.Bus(interface="udp_multicast", channel="239.74.163.2", port=p, hop_limit=0) for p in ports]
-        if kind == "unix" and channel:
-            folder = Path(channel)
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if kind == "unix":
+            Path(channel).mkdir(mode=0o700, parents=True, exist_ok=True)
             far = "robot" if side != "robot" else "host"
-            own = [None if side == "watchdog" else folder / f"{side}{leg}" for leg in range(LEGS)]
-            return [UnixBus(own[leg], folder / f"{far}{leg}") for leg in range(LEGS)]
+            own = None if side == "watchdog" else side
+            return [UnixBus(own and Path(channel, f"{own}{i}"), Path(channel, f"{far}{i}")) for i in range(LEGS)]
     except (can.CanError, OSError, ImportError, ValueError) as error:
         raise InputError(f"{spec}: {error}") from error
     raise InputError(f"bus must be socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER, got {spec!r:.60}")
@@ -115,50 +105,35 @@ class Link:
     """Exchange of a tick's frames over four buses: send all, then collect until a deadline, and wait for no motor."""
 
     def __init__(
-        self,
-        buses: Sequence[can.BusABC],
-        *,
-        reply_id: int | None = 0,
-        deadline: float = 1.0e-3,
-        pump: Callable[[], Any] | None = None,
-        lockstep: bool = False,
-        listener: Callable[[can.Message], Any] | None = None,
-    ) -> None:
+        self, buses: Sequence[can.BusABC], *, reply_id: int | None = 0, deadline: float = 1.0e-3,
+        pump: Callable[[], Any] | None = None, listener: Callable[[can.Message], Any] | None = None,
+    ) -> None:  # fmt: skip
         """Prepare the exchange.
 
         reply_id: arbitration id of the motors' replies; None: the motor's own id. deadline: longest wait [s] for
-        replies. lockstep: wait for the far end's SYNC frames instead. pump: called in lockstep after sending, which
-        advances a far end of this process. listener: called with every frame, such as a logger of python-can.
+        replies. pump: called in lockstep after sending, which may advance a far end of this process; the link then
+        waits for the far end's SYNC frames. listener: called with every frame, such as a logger of python-can.
         """
         self.buses = list(buses)
         self.received = np.zeros((), RECEIVED)
-        self._reply_id = reply_id
-        self._deadline = deadline
-        self._pump = pump
-        self._lockstep = lockstep or pump is not None
-        self._listener = listener
-        self._sensor = {each: i for i, each in enumerate(SENSOR_IDS)}
+        self.listener = listener
+        self._reply_id, self._deadline, self._pump = reply_id, deadline, pump
 
     def send(self, frames: np.ndarray) -> None:
         """Send the motors' frames (12, 8) uint8, of each bus in turn; a bus that cannot send is marked as off."""
         self.received["bus_off"] = False
-        for j in range(MOTORS):
-            for leg, bus in enumerate(self.buses):
-                self._send(leg, bus, j + 1, frames[MOTORS * leg + j].tobytes())
-        if self._lockstep:
-            for leg, bus in enumerate(self.buses):
-                self._send(leg, bus, SYNC, b"")
-
-    def _send(self, leg: int, bus: can.BusABC, arbitration_id: int, data: bytes) -> None:
-        """Send one frame on the bus of a leg."""
-        message = data_frame(arbitration_id, data, leg)
-        if self._listener is not None and arbitration_id != SYNC:
-            message.timestamp = time.time()
-            self._listener(message)
-        try:
-            bus.send(message)
-        except can.CanError:
-            self.received["bus_off"][leg] = True
+        queue = [(leg, j + 1, frames[MOTORS * leg + j].tobytes()) for j in range(MOTORS) for leg in range(LEGS)]
+        if self._pump is not None:
+            queue += [(leg, SYNC, b"") for leg in range(LEGS)]
+        for leg, number, data in queue:
+            message = data_frame(number, data, leg)
+            if self.listener is not None and number != SYNC:
+                message.timestamp = time.time()
+                self.listener(message)
+            try:
+                self.buses[leg].send(message)
+            except can.CanError:
+                self.received["bus_off"][leg] = True
 
     def collect(self) -> np.ndarray:
         """Return the frames received since the last call, a record of RECEIVED; waits until all came or the deadline.
@@ -168,9 +143,8 @@ class Link:
         record = self.received
         for name in ("motor_fresh", "sensor_fresh", "error_frames", "unknown"):
             record[name] = 0
-        if self._lockstep:
-            if self._pump is not None:
-                self._pump()
+        if self._pump is not None:
+            self._pump()
             for leg, bus in enumerate(self.buses):
                 while (message := bus.recv(LOCKSTEP_TIMEOUT)) is not None and message.arbitration_id != SYNC:
                     self._take(leg, message)
@@ -180,8 +154,7 @@ class Link:
         while not (record["motor_fresh"].all() and record["sensor_fresh"][:2].all()):
             left = end - time.monotonic()
             ready = select.select(list(waiting), [], [], max(0.0, left))[0]
-            for descriptor in ready:
-                leg = waiting[descriptor]
+            for leg in map(waiting.__getitem__, ready):
                 with suppress(can.CanError):
                     if (message := self.buses[leg].recv(0.0)) is not None:
                         self._take(leg, message)
@@ -191,24 +164,21 @@ class Link:
 
     def _take(self, leg: int, message: can.Message) -> None:
         """Store a received frame; frames of other ids are counted as unknown."""
-        record = self.received
-        data = message.data
-        if self._listener is not None:
+        record, data, number = self.received, message.data, message.arbitration_id
+        motor = data[0] if len(data) == 8 else 0
+        if self.listener is not None:
             message.channel = leg
-            self._listener(message)
+            self.listener(message)
         if message.is_error_frame:
             record["error_frames"] = min(255, int(record["error_frames"]) + 1)
-            return
-        sensor = self._sensor.get(message.arbitration_id) if leg == 0 else None
-        if sensor is not None and len(data) == 8:
-            record["sensor"][sensor] = np.frombuffer(data, np.uint8)
-            record["sensor_fresh"][sensor] = True
-            return
-        expected = data[0] if self._reply_id is None and len(data) else self._reply_id
-        if len(data) == 8 and 1 <= data[0] <= MOTORS and message.arbitration_id == expected:
-            motor = MOTORS * leg + data[0] - 1
-            record["motor"][motor] = np.frombuffer(data, np.uint8)
-            record["motor_fresh"][motor] = True
+        elif leg == 0 and number in SENSOR_IDS and len(data) == 8:
+            row = SENSOR_IDS.index(number)
+            record["sensor"][row] = np.frombuffer(data, np.uint8)
+            record["sensor_fresh"][row] = True
+        elif 1 <= motor <= MOTORS and number == (motor if self._reply_id is None else self._reply_id):
+            row = MOTORS * leg + motor - 1
+            record["motor"][row] = np.frombuffer(data, np.uint8)
+            record["motor_fresh"][row] = True
         else:
             record["unknown"] = min(255, int(record["unknown"]) + 1)
 

@@ -16,11 +16,6 @@ ENTER, EXIT, ZERO = (bytes([0xFF] * 7 + [last]) for last in (0xFC, 0xFD, 0xFE))
 COMMAND_BITS = (16, 12, 12, 12, 12)  # position, velocity, kp, kd, torque
 REPLY_BITS = (16, 12, 12)  # position, velocity, torque, after the motor's id
 HOST_ID = 0  # Arbitration id of replies, whose first byte is the motor's id
-ERRORS = {
-    0: "none", 1: "over-temperature", 2: "over-current", 3: "over-voltage", 4: "under-voltage", 5: "encoder",
-    6: "phase imbalance",
-}  # fmt: skip
-"""Meaning of a reply's error codes."""
 KINDS = {"AK80-9": 18.0, "AK70-10": 25.0}  # Full scale of the torque by type of motor [N m]
 
 
@@ -31,7 +26,7 @@ class Reply(NamedTuple):
     velocity: np.ndarray  # (n,) [rad/s]
     torque: np.ndarray  # (n,) [N m]
     temperature: np.ndarray  # (n,) [°C]
-    error: np.ndarray  # (n,) error code, see ERRORS
+    error: np.ndarray  # (n,) error code: 0 none, 1 temperature, 2 current, 3 and 4 voltage, 5 encoder, 6 phases
 
 
 class Codec:
@@ -43,10 +38,8 @@ class Codec:
         upper = [np.full(len(torque), value) for value in (12.5, 50.0, 500.0, 5.0)] + [torque]
         lower = [-upper[0], -upper[1], 0.0 * upper[2], 0.0 * upper[3], -torque]
         codes = 2 ** np.array(COMMAND_BITS)[:, None] - 1
-        self.lower, self.upper = (
-            np.array(lower),
-            np.array(upper),
-        )  # (5, n) [rad], [rad/s], [N m/rad], [N m s/rad], [N m]
+        self.lower = np.array(lower)  # (5, n) [rad], [rad/s], [N m/rad], [N m s/rad], [N m]
+        self.upper = np.array(upper)
         self.factor = (self.upper - self.lower) / codes
         self.largest = np.broadcast_to(codes, self.lower.shape).copy()
         self.largest[2] -= 1  # kp below its full scale: no command equals ENTER, EXIT or ZERO
@@ -64,13 +57,11 @@ class Codec:
         Values beyond their range saturate. Raises ValueError: one is NaN.
         """
         position, velocity, kp, kd, torque = self.codes(commands)
-        return np.stack(
-            [
-                position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | kp >> 8, kp & 255, kd >> 4,
-                (kd & 15) << 4 | torque >> 8, torque & 255,
-            ],
-            axis=1,
-        ).astype(np.uint8)  # fmt: skip
+        columns = [
+            position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | kp >> 8, kp & 255, kd >> 4,
+            (kd & 15) << 4 | torque >> 8, torque & 255,
+        ]  # fmt: skip
+        return np.array(columns, np.uint8).T
 
     def decode_command(self, data: np.ndarray) -> np.ndarray:
         """Return the commands (5, n) in command frames (n, 8)."""
@@ -84,17 +75,14 @@ class Codec:
     def encode_reply(self, ids: np.ndarray, reply: Reply) -> np.ndarray:
         """Return the data of reply frames, (n, 8) uint8; ids: (n,) ids of the motors on their buses."""
         zero = np.zeros_like(reply.position)
-        position, velocity, _, _, torque = self.codes(
-            np.stack([reply.position, reply.velocity, zero, zero, reply.torque])
-        )
+        rows = [reply.position, reply.velocity, zero, zero, reply.torque]
+        position, velocity, _, _, torque = self.codes(np.array(rows))
         temperature = np.clip(np.rint(reply.temperature), 0, 255).astype(np.int64)
-        return np.stack(
-            [
-                ids, position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | torque >> 8, torque & 255,
-                temperature, reply.error,
-            ],
-            axis=1,
-        ).astype(np.uint8)  # fmt: skip
+        columns = [
+            ids, position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | torque >> 8, torque & 255,
+            temperature, reply.error,
+        ]  # fmt: skip
+        return np.array(columns, np.uint8).T
 
     def decode_reply(self, data: np.ndarray) -> Reply:
         """Return the values in reply frames (n, 8)."""
@@ -118,8 +106,10 @@ def dbc(kinds: Sequence[str]) -> str:
         return f' SG_ {name} : {start}|{bits}@0+ ({factor!r},{lower!r}) [{lower!r}|{upper!r}] "{unit}" {receiver}'
 
     lines = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_: host motor", ""]
-    rows = (("position", 7, "rad"), ("velocity", 23, "rad/s"), ("kp", 27, "Nm/rad"), ("kd", 47, "Nms/rad"))
-    rows += (("torque", 51, "Nm"),)
+    rows = (
+        ("position", 7, "rad"), ("velocity", 23, "rad/s"), ("kp", 27, "Nm/rad"), ("kd", 47, "Nms/rad"),
+        ("torque", 51, "Nm"),
+    )  # fmt: skip
     for motor in range(len(kinds)):
         lines.append(f"BO_ {motor + 1} command_{motor + 1}: 8 host")
         for row, (name, start, unit) in enumerate(rows):

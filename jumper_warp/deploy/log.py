@@ -24,7 +24,7 @@ class Log:
     """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
     def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
-        """Create the folder and the files; capture: whether the source is a `MotionCapture`; frames: .asc, .blf, .csv."""
+        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv."""
         folder.mkdir(parents=True, exist_ok=True)
         about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")

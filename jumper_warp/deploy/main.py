@@ -74,13 +74,12 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
     rate = options.rate or int(bundle.settings["rate"])
     log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
-    link = Link(
-        open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], lockstep=options.lockstep,
-        deadline=0.5 / rate, listener=None if log is None else log.frame,
-    )  # fmt: skip
+    pump = (lambda: None) if options.lockstep else None
+    link = Link(open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
     source = MotionCapture() if options.capture else None
-    listener = None if log is None else log.tick
-    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run, listener=listener)
+    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    if log is not None:
+        link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Script(DEMO, rate) if options.demo else Keyboard(options.height, options.place)
     last = State.PASSIVE

@@ -15,7 +15,7 @@ import numpy as np
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import RECEIVED, Link
 from jumper_warp.deploy.codec import ENTER, EXIT, ZERO
-from jumper_warp.deploy.control import Gains, clip_target
+from jumper_warp.deploy.control import Gains, clip_target, motor_torque
 from jumper_warp.deploy.estimator import Estimator, EstimatorCfg
 from jumper_warp.deploy.motions import BallisticLanding, JointTest, Ramp, SignTest
 from jumper_warp.deploy.safety import Fault, Safety
@@ -73,19 +73,13 @@ class Runtime:
     """State machine, policies, safety and motor commands of one robot."""
 
     def __init__(
-        self,
-        bundle: Bundle,
-        link: Link,
-        source: Estimator | MotionCapture | None = None,
-        *,
-        rate: int = 480,
-        dry_run: bool = False,
-        listener: Callable[[np.ndarray], Any] | None = None,
-    ) -> None:
+        self, bundle: Bundle, link: Link, source: Estimator | MotionCapture | None = None, *,
+        rate: int = 480, dry_run: bool = False,
+    ) -> None:  # fmt: skip
         """Start in PASSIVE.
 
         source: of the base's state; None: an estimator with the bundle's settings. rate: ticks a second. dry_run:
-        compute commands, and send frames that switch the motors off. listener: called with the record of every tick.
+        compute commands, and send frames that switch the motors off.
         """
         settings = bundle.settings
         self.bundle = bundle
@@ -93,7 +87,7 @@ class Runtime:
         self.source = Estimator(EstimatorCfg(**settings["estimator"])) if source is None else source
         self.dt = 1.0 / rate
         self.dry_run = dry_run
-        self.listener = listener
+        self.listener: Callable[[np.ndarray], Any] | None = None  # called with the record of every tick
         self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
         self.motion = Motion(settings["switch"])
         self.skills: dict[State, Skill] = {}
@@ -191,7 +185,7 @@ class Runtime:
         tilt = 0.0 if lies or flies else float(np.arccos(np.clip(-self.motion.gravity[2], -1.0, 1.0)))
         limit = np.maximum(self._gains.limit, np.abs(self._asked))
         target, kp, kd = self._driven
-        self._asked = kp * (target - self.q) - kd * self.qd
+        self._asked = motor_torque(target, self.q, self.qd, Gains(kp, kd, self.bundle.curve.peak), self.bundle.curve)
         return self.safety.check(
             record["received"], self.q, self.qd, self.torque, limit, self.temperature, self.error, tilt=tilt,
             stale=self.stale, diverged=bool(self.estimate.diverged), finite=self._finite, late=float(record["late"]),

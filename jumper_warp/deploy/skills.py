@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.deploy.control import Gains
-from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.deploy.policy import LAST_ACTION, DeployedPolicy, JumpCommand
 from jumper_warp.deploy.sensors import Estimate
 
 SQUAT_STEPS = 30  # policy steps from a jump skill's begin to its command
@@ -90,13 +90,10 @@ class Skill:
     def targets(self, motion: Motion) -> np.ndarray:
         """Return the motor targets [rad], (12,). Raises InputError: a reading is implausible or not finite."""
         readings = motion.readings() | self.command(motion)
-        action = self.policy.act(self.policy.observe({name: readings[name] for name in self._terms()}))
+        names = [name for name in self.policy.layout if name != LAST_ACTION]
+        action = self.policy.act(self.policy.observe({name: readings[name] for name in names}))
         target = self.policy.default + self.policy.scale * action
         return self.policy.filter_targets(target, motion.q, motion.qd)
-
-    def _terms(self) -> list[str]:
-        """Return the names of the readings that the policy takes."""
-        return [name for name in self.policy.layout if name != "last_action"]
 
     def command(self, motion: Motion) -> dict[str, Any]:
         """Return the readings of the command."""
@@ -143,11 +140,6 @@ class Jump(Skill):
         self.landed = 0  # policy steps since landing
         self.phase = JumpCommand()
         self.took_off = False
-
-    @property
-    def in_flight(self) -> bool:
-        """Whether the robot has taken off and not landed."""
-        return self.phase.in_flight
 
     def command(self, motion: Motion) -> dict[str, Any]:
         """Return the readings of the command, and update the phase of the jump."""
