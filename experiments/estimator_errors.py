@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.deploy.estimator import GRAVITY, Estimator, matrix_of, quaternion_of
+from jumper_warp.deploy.estimator import GRAVITY, IDENTITY, Estimator, quaternion_of, skew
 from jumper_warp.deploy.kinematics import legs
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
@@ -44,6 +44,12 @@ class Args(EvaluationArgs):
     seconds: float = 3.2  # [s] Simulated time
     wait: float = 1.5  # [s] Time before a jump is commanded
     save: Path | None = None  # npz file for estimator_gtsam.py
+
+
+def matrix_of(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), xyzw."""
+    cross = skew(quaternion[..., :3])
+    return IDENTITY + 2.0 * quaternion[..., 3, None, None] * cross + 2.0 * cross @ cross
 
 
 class Ticks:

@@ -34,11 +34,6 @@ class TorqueCurve(NamedTuple):
     fade_start: np.ndarray  # [rad/s] over-speed protection reduces the torque from here
     fade_end: np.ndarray  # [rad/s] no torque from here
 
-    @classmethod
-    def from_yaml(cls, fields: Mapping[str, Any]) -> TorqueCurve:
-        """Return the section torque_curve of deploy.yaml, whose keys are the fields."""
-        return cls(*(np.array(fields[name], dtype=np.float32) for name in cls._fields))
-
 
 ONE, NONE = np.float32(1.0), np.float32(0.0)
 

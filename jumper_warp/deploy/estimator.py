@@ -55,7 +55,6 @@ class EstimatorCfg:
     start_place: float = 1.0e-4  # [m], [rad] Horizontal position and yaw; larger with fixes in another frame
     fix_delay: float | None = None  # [s] Age of the captured frames that correct the state; None: unused
     fix_position: float = 0.005  # [m] Noise of external positions
-    fix_rotation: float = 0.01  # [rad] Noise of external orientations
 
 
 def skew(v: np.ndarray) -> np.ndarray:
@@ -79,12 +78,6 @@ def quaternion_of(matrix: np.ndarray) -> np.ndarray:
     return row / np.sqrt((row * row).sum(-1, keepdims=True))
 
 
-def matrix_of(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), xyzw."""
-    cross = skew(quaternion[..., :3])
-    return IDENTITY + 2.0 * quaternion[..., 3, None, None] * cross + 2.0 * cross @ cross
-
-
 def level(accel: np.ndarray) -> np.ndarray:
     """Return the rotations (..., 3, 3) with zero yaw of a body at rest with specific force accel (..., 3)."""
     up = accel / np.linalg.norm(accel, axis=-1, keepdims=True)
@@ -100,17 +93,16 @@ class Estimator:
         """Store the settings; `reset` allocates the state."""
         self.cfg = EstimatorCfg() if cfg is None else cfg
 
-    def reset(self, gyro: np.ndarray, accel: np.ndarray, q: np.ndarray, quaternion: np.ndarray | None = None) -> None:
+    def reset(self, gyro: np.ndarray, accel: np.ndarray, q: np.ndarray) -> None:
         """Start with a robot at rest on level ground z = 0, above the origin.
 
-        gyro (3,) [rad/s], accel (3,) [m/s^2], q (12,) [rad]: readings at rest, averaged over some 0.1 s.
-        quaternion: (4,) xyzw; None: tilt from accel, yaw 0.
+        gyro (3,) [rad/s], accel (3,) [m/s^2], q (12,) [rad]: readings at rest, averaged over some 0.1 s. The yaw is 0.
         """
         cfg = self.cfg
         self.single = np.ndim(q) == 1
         gyro, accel, q = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (gyro, accel, q))
         n = len(q)
-        self.rot = level(accel) if quaternion is None else matrix_of(np.atleast_2d(quaternion))
+        self.rot = level(accel)
         self.pos = np.zeros((n, 3))
         self.pos[:, 2] = PAW_RADIUS - (legs(q)[0] @ self.rot[:, 2, :, None]).mean((1, 2))
         self.vel = np.zeros((n, 3))
@@ -228,28 +220,18 @@ class Estimator:
     def receive(self, frames: np.ndarray) -> None:
         """Correct with the frames of a motion capture, (3, 8) uint8, if `fix_delay` is set."""
         if self.cfg.fix_delay is not None:
-            captured = unpack_capture(frames)
-            self.fix(captured.position, captured.quaternion, self.time - self.cfg.fix_delay)
+            self.fix(unpack_capture(frames).position, self.time - self.cfg.fix_delay)
 
-    def fix(self, position: np.ndarray, quaternion: np.ndarray | None, time: float) -> None:
-        """Correct with a position (3,) [m], world, and orientation (4,) xyzw or None, measured at `time` [s] on `time`.
+    def fix(self, position: np.ndarray, time: float) -> None:
+        """Correct with a position (3,) [m], world, measured at `time` [s], up to `HISTORY` updates ago.
 
-        The position is compared with the estimate at that time, up to `HISTORY` updates ago; the orientation with the
-        present one.
+        It is compared with the estimate at that time.
         """
         past = min(self._past, key=lambda entry: abs(entry[0] - time))[1]
         jacobian = np.zeros((len(past), 3, SIZE))
         jacobian[:, :, POS] = IDENTITY
         jacobian[:, :, ROT] = -skew(past)
         self._correct(jacobian, np.atleast_2d(position) - past, np.full((len(past), 3), self.cfg.fix_position**2))
-        if quaternion is None:
-            return
-        turn = matrix_of(np.atleast_2d(quaternion)) @ np.swapaxes(self.rot, -1, -2)
-        q = quaternion_of(turn)
-        jacobian = np.zeros((3, SIZE))
-        jacobian[:, ROT] = IDENTITY
-        noise = np.full((len(past), 3), self.cfg.fix_rotation**2)
-        self._correct(jacobian, 2.0 * np.copysign(1.0, q[:, 3:]) * q[:, :3], noise)
 
     def estimate(self) -> Estimate:
         """Return the present estimate."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import Log, replay
-from jumper_warp.deploy.operator import HELP, Keyboard, Script, raw_terminal
+from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
 from jumper_warp.deploy.runtime import Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
@@ -81,13 +82,14 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     if log is not None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
-    operator = Script(DEMO, rate) if options.demo else Keyboard(options.height, options.place)
-    last = State.PASSIVE
+    operator = Keyboard(options.height, options.place)
+    script = {round(at * rate): (request, values) for at, request, values in DEMO}
+    ticks, last = itertools.count(), State.PASSIVE
 
     def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state."""
         nonlocal last
-        runtime.tick(*operator.poll(), late=late)
+        runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
         if dog is not None:
             dog.beat()
         if runtime.state != last:

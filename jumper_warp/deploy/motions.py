@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -40,15 +40,21 @@ class Ramp:
 TEST_TIMES = (0.25, 0.40, 0.65, 1.0)  # [s] of each motion of a test: moved, measured, back, at rest
 
 
-class _Test:
-    """Moves joints of a robot in the default pose and back, one part after the other, and compares the response."""
+LEGS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))  # front, left of FL, FR, BL, BR
+LEAST = 0.004  # least change of gravity's direction [1] toward the opposite corner
 
-    parts = 1
 
-    def __init__(self, default: np.ndarray, dt: float) -> None:
-        """Start in the default pose (12,) [rad]; dt: time of a tick [s]."""
-        self._default = default
-        self._dt = dt
+class MotionTest:
+    """Moves parts of a robot in the default pose and back, one after the other, and compares the response."""
+
+    def __init__(
+        self, default: np.ndarray, dt: float, offsets: np.ndarray, fails: Callable[[int, np.ndarray, np.ndarray], bool]
+    ) -> None:
+        """Start in the default pose (12,) [rad]; dt: time of a tick [s]; offsets: motions (parts, 12) [rad].
+
+        fails: whether the response of a part is wrong: of the joints (12,) [rad], of gravity in the body (3,).
+        """
+        self._default, self._dt, self._offsets, self._fails = default, dt, np.float32(offsets), fails
         self._ticks = round(TEST_TIMES[-1] / dt)
         self._tick = 0
         self.failed = False
@@ -56,66 +62,42 @@ class _Test:
     @property
     def done(self) -> bool:
         """Whether all parts have been tested."""
-        return self._tick >= self.parts * self._ticks
+        return self._tick >= len(self._offsets) * self._ticks
 
     def step(self, motion: Motion) -> np.ndarray:
         """Advance a tick and return the targets [rad], (12,)."""
-        target = self._default.copy()
         if self.done:
-            return target
+            return self._default
         part, tick = divmod(self._tick, self._ticks)
         self._tick += 1
         if tick == 0:
             self._q, self._gravity = motion.q, motion.gravity
         if tick == round(TEST_TIMES[1] / self._dt):
-            self.failed |= bool(self.fails(part, motion.q - self._q, motion.gravity - self._gravity))
+            self.failed |= bool(self._fails(part, motion.q - self._q, motion.gravity - self._gravity))
         fraction = np.interp(tick * self._dt, (0.0, *TEST_TIMES), (0.0, 1.0, 1.0, 0.0, 0.0))
-        return target + np.float32(fraction) * self.offset(part)
-
-    def offset(self, part: int) -> np.ndarray:
-        """Return the motion of the joints [rad], (12,)."""
-        raise NotImplementedError
-
-    def fails(self, part: int, moved: np.ndarray, change: np.ndarray) -> bool:
-        """Return whether the response is wrong: of the joints (12,) [rad], of gravity's direction in the body (3,)."""
-        raise NotImplementedError
+        return self._default + np.float32(fraction) * self._offsets[part]
 
 
-class SignTest(_Test):
+def sign_test(default: np.ndarray, dt: float) -> MotionTest:
     """Extend one leg after the other of a standing robot: the base must tilt away from it, else cables are swapped."""
 
-    parts = 4
-    LEGS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))  # front, left of FL, FR, BL, BR
-    ANGLE = 0.25  # [rad] of outer and inner joint
-    LEAST = 0.004  # least change of gravity's direction [1] toward the opposite corner
-
-    def offset(self, part: int) -> np.ndarray:
-        """Return the extension of a leg."""
-        return np.float32(-self.ANGLE) * np.isin(np.arange(12), (3 * part + 1, 3 * part + 2))
-
-    def fails(self, part: int, moved: np.ndarray, change: np.ndarray) -> bool:
+    def fails(leg: int, moved: np.ndarray, change: np.ndarray) -> bool:
         """Return whether gravity does not turn: a raised front-left corner tilts the base backward and to the right."""
-        front, left = self.LEGS[part]
-        return -front * change[0] < self.LEAST or -left * change[1] < self.LEAST
+        front, left = LEGS[leg]
+        return -front * change[0] < LEAST or -left * change[1] < LEAST
+
+    return MotionTest(default, dt, -0.25 * np.kron(np.eye(4), [0.0, 1.0, 1.0]), fails)
 
 
-class JointTest(_Test):
+def joint_test(default: np.ndarray, joint: int, dt: float) -> MotionTest:
     """Move one joint of a robot on a stand: it alone must follow, in the direction that the operator expects."""
+    offset = 0.15 * np.eye(12)[joint]  # [rad]
 
-    ANGLE = 0.15  # [rad]
+    def fails(part: int, moved: np.ndarray, change: np.ndarray) -> bool:
+        """Return whether a joint's motion differs from its command by half the angle."""
+        return bool((np.abs(moved - offset) > 0.5 * offset.max()).any())
 
-    def __init__(self, default: np.ndarray, joint: int, dt: float) -> None:
-        """Start in the default pose (12,) [rad]; joint: number; dt: time of a tick [s]."""
-        super().__init__(default, dt)
-        self._moves = np.arange(12) == joint
-
-    def offset(self, part: int) -> np.ndarray:
-        """Return the motion of the joint."""
-        return np.float32(self.ANGLE) * self._moves
-
-    def fails(self, part: int, moved: np.ndarray, change: np.ndarray) -> bool:
-        """Return whether the joint moves less than half the angle, or another one more."""
-        return bool((moved[self._moves] < 0.5 * self.ANGLE).any() or (moved[~self._moves] > 0.5 * self.ANGLE).any())
+    return MotionTest(default, dt, offset[None], fails)
 
 
 class BallisticLanding:

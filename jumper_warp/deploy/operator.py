@@ -6,7 +6,7 @@ import os
 import select
 import struct
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, ClassVar
 
@@ -84,20 +84,6 @@ class Keyboard:
             key = {Request.JUMP_UP: "j", Request.JUMP_TO: "g"}.get(request)
             return self._jumps[key] if key else (request, tuple(self._velocity))
         return NOTHING
-
-
-class Script:
-    """Requests at given ticks, such as of a test."""
-
-    def __init__(self, commands: Iterable[tuple[float, Request, tuple[float, ...]]], rate: int) -> None:
-        """Take (time [s], request, values) for a loop of `rate` [Hz]."""
-        self._commands = {round(time * rate): (request, values) for time, request, values in commands}
-        self._tick = -1
-
-    def poll(self) -> Command:
-        """Return the request of the next tick."""
-        self._tick += 1
-        return self._commands.get(self._tick, NOTHING)
 
 
 @contextmanager

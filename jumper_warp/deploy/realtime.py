@@ -32,8 +32,7 @@ def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict
     """
     period = 1.0 / rate
     begin = due = time.monotonic() + period
-    late: list[float] = []
-    work: list[float] = []
+    times: list[tuple[float, float]] = []  # lateness and work of each tick
     missed = 0
     gc.collect()
     gc.freeze()
@@ -45,10 +44,8 @@ def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict
                 time.sleep(rest)
             while (now := time.monotonic()) < due:
                 pass
-            lateness = now - due
-            tick(lateness)
-            late.append(lateness)
-            work.append(time.monotonic() - now)
+            tick(now - due)
+            times.append((now - due, time.monotonic() - now))
             due += period
             while due + period < time.monotonic():
                 due += period
@@ -56,14 +53,14 @@ def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict
     finally:
         gc.enable()
         gc.unfreeze()
-    return statistics(np.array(late), np.array(work), missed, period)
+    return statistics(np.array(times).T, missed, period)
 
 
-def statistics(late: np.ndarray, work: np.ndarray, missed: int, period: float) -> dict[str, Any]:
-    """Return quantiles of lateness and of work (n,) [s], the share of missed ticks, and the load of a tick."""
-    result: dict[str, Any] = {"ticks": len(late), "missed": missed / max(1, len(late) + missed)}
-    for name, values in (("late", late), ("work", work)):
-        for quantile in (0.5, 0.99, 0.999, 1.0):
-            result[f"{name}_p{100 * quantile:g}_us"] = 1.0e6 * float(np.quantile(values, quantile))
-    result["work_p99_of_tick"] = result["work_p99_us"] / (1.0e6 * period)
-    return result
+def statistics(times: np.ndarray, missed: int, period: float) -> dict[str, Any]:
+    """Return quantiles of lateness and work, (2, n) [s], the share of missed ticks, and the load of a tick."""
+    count = times.shape[1]
+    result: dict[str, Any] = {"ticks": count, "missed": missed / max(1, count + missed)}
+    for quantile in (0.5, 0.99, 0.999, 1.0):
+        for name, value in zip(("late", "work"), np.quantile(times, quantile, axis=1), strict=True):
+            result[f"{name}_p{100 * quantile:g}_us"] = 1.0e6 * float(value)
+    return result | {"work_p99_of_tick": result["work_p99_us"] / (1.0e6 * period)}

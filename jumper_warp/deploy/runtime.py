@@ -17,7 +17,7 @@ from jumper_warp.deploy.bus import RECEIVED, Link
 from jumper_warp.deploy.codec import ENTER, EXIT, ZERO
 from jumper_warp.deploy.control import Gains, clip_target, motor_torque
 from jumper_warp.deploy.estimator import Estimator, EstimatorCfg
-from jumper_warp.deploy.motions import BallisticLanding, JointTest, Ramp, SignTest
+from jumper_warp.deploy.motions import BallisticLanding, Ramp, joint_test, sign_test
 from jumper_warp.deploy.safety import Fault, Safety
 from jumper_warp.deploy.sensors import UNKNOWN, MotionCapture, unpack_imu
 from jumper_warp.deploy.skills import Jump, Motion, Skill, Walk
@@ -221,9 +221,9 @@ class Runtime:
         elif request == Request.HOLD and state == State.WALK:
             self._enter(State.HOLD)
         elif request == Request.CONFIRM and state == State.HOLD:
-            self._procedure = SignTest(self.bundle.default, self.dt)
+            self._procedure = sign_test(self.bundle.default, self.dt)
         elif request == Request.JOINT and state == State.HOLD:
-            self._procedure = JointTest(self.bundle.default, int(values[0]), self.dt)
+            self._procedure = joint_test(self.bundle.default, int(values[0]), self.dt)
         elif request == Request.WALK and state == State.WALK:
             self.skill.wanted = np.clip(values, self.skill.lowest, self.skill.highest)
         elif request == Request.WALK and state == State.HOLD and State.WALK in self.skills:

@@ -26,18 +26,20 @@ DAMPING_TIME = 2.0  # [s]
 PERIOD = 0.002  # [s] between damping commands
 
 
-def watch(pipe: int, spec: str, settings: dict[str, Any], silence: float, damping_time: float) -> None:
+def watch(pipe: int, other: int, spec: str, settings: dict[str, Any], silence: float, damping_time: float) -> None:
     """Wait until the pipe (a file descriptor) closes or is silent, then brake and switch the motors off.
 
-    spec: of the buses, see `open_buses`. settings: of deploy.yaml. A byte `q` on the pipe ends the watch without that.
+    other: the end of the pipe that the runtime writes to. spec: of the buses, see `open_buses`. settings: of
+    deploy.yaml. A byte `q` on the pipe ends the watch without that.
     """
+    os.close(other)
+    os.setsid()  # signals of the terminal do not reach it
     link = Link(open_buses(spec, "watchdog"))
     while select.select([pipe], [], [], silence)[0]:
-        data = os.read(pipe, 4096)
+        if not (data := os.read(pipe, 4096)):
+            break
         if b"q" in data:
             return
-        if not data:
-            break
     brake(link, settings, damping_time)
 
 
@@ -63,19 +65,11 @@ class Watchdog:
     ) -> None:
         """Start the process; arguments: as in `watch`."""
         reader, self._writer = os.pipe()
-        context = multiprocessing.get_context("fork")
-        self.process = context.Process(
-            target=self._run, args=(reader, spec, settings, silence, damping_time), daemon=False
-        )
+        arguments = (reader, self._writer, spec, settings, silence, damping_time)
+        self.process = multiprocessing.get_context("fork").Process(target=watch, args=arguments, daemon=False)
         os.set_blocking(self._writer, False)
         self.process.start()
         os.close(reader)
-
-    def _run(self, reader: int, *arguments: Any) -> None:
-        """Watch, without the end of the pipe that the runtime writes to."""
-        os.close(self._writer)
-        os.setsid()  # signals of the terminal do not reach it
-        watch(reader, *arguments)
 
     def beat(self) -> None:
         """Report that the runtime has done a tick."""

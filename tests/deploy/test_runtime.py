@@ -8,7 +8,7 @@ import pytest
 from jumper_warp.bench.bus_sim import BusFaults
 from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.log import Log, read_log, replay
-from jumper_warp.deploy.motions import JointTest
+from jumper_warp.deploy.motions import joint_test
 from jumper_warp.deploy.runtime import Request, State
 
 
@@ -55,9 +55,12 @@ def test_walk_and_jump_to_a_place_replay_bit_for_bit(make_robot, bundle, tmp_pat
 
 @pytest.mark.parametrize(
     ("faults", "tolerance"),
-    [({}, 0.03), ({"drop": 0.01, "seed": 1}, 0.1), ({"delay": 0.5}, 0.1), ({"gyro_noise": 5e-3, "accel_noise": 0.05}, 0.05)],
+    [
+        ({}, 0.03), ({"drop": 0.01, "seed": 1}, 0.1), ({"delay": 0.5}, 0.1),
+        ({"gyro_noise": 5e-3, "accel_noise": 0.05}, 0.05),
+    ],
     ids=["no fault", "1 % of frames lost", "a tick of jitter", "estimator and noise"],
-)
+)  # fmt: skip
 def test_jump_up_over_the_bus_reaches_its_height(faults, tolerance, make_robot):
     robot = make_robot(BusFaults(**faults), Estimator() if "gyro_noise" in faults else None)
     robot.stand()
@@ -87,7 +90,7 @@ def test_zeroing_makes_the_angle_of_one_joint_its_offset(make_robot):
 
 @pytest.mark.parametrize(("follows", "fails"), [(3, False), (None, True), (4, True)])
 def test_joint_test_fails_unless_the_joint_alone_follows(follows, fails, bundle):
-    test = JointTest(bundle.default, 3, 1.0 / 480.0)
+    test = joint_test(bundle.default, 3, 1.0 / 480.0)
     q, largest = bundle.default.copy(), 0.0
     while not test.done:
         target = test.step(SimpleNamespace(q=q, gravity=np.zeros(3)))
