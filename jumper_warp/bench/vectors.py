@@ -40,9 +40,8 @@ def record_vectors(policy: Policy, episodes: int = EPISODES, steps: int = STEPS)
     for step in range(steps):
         episode, within = divmod(step, steps // episodes)
         if within == 0 and episode < episodes:
-            command = COMMANDS[term][episode]
-            row = command if term == "command" else [*command, COMMAND_STEP]
-            env.evaluation_reset([row], 0.5)
+            at = [] if term == "command" else [COMMAND_STEP]
+            env.evaluation_reset([COMMANDS[term][episode] + at], 0.5)
         obs = env.obs.clone()
         action = policy.act(obs)
         angle = motor_values(env.sim.joint_q()[0, 7:]).copy()
@@ -54,7 +53,7 @@ def record_vectors(policy: Policy, episodes: int = EPISODES, steps: int = STEPS)
         env.step(action)
         target = env.robot.filtered_target.numpy()[:, 0].copy()
         values = (obs[0].numpy(), action[0].numpy(), target, within == 0 and episode < episodes, angle, rate)
-        for name, value in zip(("observation", "action", "target", "reset", "angle", "rate"), values, strict=True):
+        for name, value in zip(rows, values, strict=False):
             rows[name].append(value)
     arrays = {name: np.array(values) for name, values in rows.items()}
     vectors = _frames(arrays, policy)
@@ -67,19 +66,17 @@ def record_vectors(policy: Policy, episodes: int = EPISODES, steps: int = STEPS)
 def _frames(arrays: dict[str, np.ndarray], policy: Policy) -> dict[str, np.ndarray]:
     """Return the motors' frames of the first policy steps, gains, and names; motor 3 · leg + j is joint 3 · leg + j."""
     motors = [motor.type for motor in load_description().motors]
-    codec = Codec(motors)
+    codec, zero = Codec(motors), np.zeros(12)
     spec = policy.interface
-    zero = np.zeros(12)
+    gains = np.array([spec.joint_stiffness, spec.joint_damping, spec.torque_limit])
     replies, commands = [], []
-    for step in range(min(FRAMES, len(arrays["action"]))):
-        reply = Reply(arrays["angle"][step], arrays["rate"][step], zero, zero + 35.0, zero.astype(int))
+    for angle, rate, target in zip(*(arrays[name][:FRAMES] for name in ("angle", "rate", "target")), strict=True):
+        reply = Reply(angle, rate, zero, zero + 35.0, zero.astype(int))
         replies.append(codec.encode_reply(np.tile([1, 2, 3], 4), reply))
-        rows = [arrays["target"][step], zero, spec.joint_stiffness, spec.joint_damping, zero]
-        commands.append(codec.encode(np.array(rows, dtype=float)))
+        commands.append(codec.encode(np.array([target, zero, *gains[:2], zero])))
     decoded = [codec.decode_reply(frames) for frames in replies]
     return {
-        "motors": np.array(motors), "joint_names": np.array(spec.joint_names),
-        "gains": np.array([spec.joint_stiffness, spec.joint_damping, spec.torque_limit], dtype=np.float32),
+        "motors": np.array(motors), "joint_names": np.array(spec.joint_names), "gains": gains.astype(np.float32),
         "replies": np.array(replies), "commands": np.array(commands),
         "reply_angle": np.array([each.position for each in decoded], dtype=np.float32),
         "reply_rate": np.array([each.velocity for each in decoded], dtype=np.float32),

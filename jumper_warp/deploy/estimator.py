@@ -49,9 +49,7 @@ class EstimatorCfg:
     accel_bias: float = 0.03  # [m/s^2] At the start
     force: float = 20.0  # [N] Least vertical paw force of a contact
     speed: float = 0.6  # [m/s] Greatest speed of a paw in contact
-    still: float = 0.3  # [m/s] Greatest speed of a paw in contact without motor torque, as on hard stops
-    support: float = 5.0  # [m/s^2] Least filtered vertical specific force of such a contact
-    support_time: float = 0.03  # [s] Time constant of that filter
+    still: float = 0.3  # [m/s] Greatest speed of a paw in contact without motor torque, as hard stops carry
     start_place: float = 1.0e-4  # [m], [rad] Horizontal position and yaw; larger with fixes in another frame
     fix_delay: float | None = None  # [s] Age of the captured frames that correct the state; None: unused
     fix_position: float = 0.005  # [m] Noise of external positions
@@ -109,7 +107,6 @@ class Estimator:
         self.gyro_bias = gyro.copy()
         self.accel_bias = np.zeros((n, 3))
         self.contact = np.ones((n, 4), dtype=bool)
-        self.support = np.full(n, 9.81)  # [m/s^2] filtered vertical specific force
         tilt, spin, force, place = [cfg.start_tilt] * 2, [cfg.gyro_bias] * 3, [cfg.accel_bias] * 3, cfg.start_place
         sigma = np.array([*tilt, place, *[0.01] * 3, place, place, cfg.start_height, *spin, *force])
         self.cov = np.tile(np.diag(sigma**2), (n, 1, 1))
@@ -139,7 +136,6 @@ class Estimator:
         half = rotation(0.5 * dt * rate)
         middle = self.rot @ half
         acceleration = (middle @ force[..., None])[..., 0] + GRAVITY
-        self.support = self.support + dt / (dt + cfg.support_time) * (acceleration[:, 2] + 9.81 - self.support)
         flow = self._flow(dt)
         self.pos = self.pos + dt * self.vel + 0.5 * dt * dt * acceleration
         self.vel = self.vel + dt * acceleration
@@ -178,13 +174,12 @@ class Estimator:
         residual = implied - self.vel[:, None]
         height = (point @ up[..., None])[..., 0] + self.pos[:, None, 2]
         # static balance, as damped least squares: an aligned thigh and shank transmit no force to the motor
-        square = jacobian @ jacobian.swapaxes(-1, -2) + 1.0e-5 * IDENTITY
-        force = -(up[:, None, None] @ np.linalg.solve(square, jacobian @ torque))[..., 0, 0]
+        normal = jacobian @ jacobian.swapaxes(-1, -2) + 1.0e-5 * IDENTITY
+        force = -(up[:, None, None] @ np.linalg.solve(normal, jacobian @ torque))[..., 0, 0]
         square = residual * residual
         speed = np.sqrt(square.sum(-1))
         pushed = (speed < cfg.speed) & (force > np.where(self.contact, 0.5, 1.0) * cfg.force)
-        supported = (self.support > cfg.support)[:, None]  # hard stops carry load without motor torque
-        self.contact = (pushed | ((speed < cfg.still) & supported)) & (height < cfg.near)
+        self.contact = (pushed | (speed < cfg.still)) & (height < cfg.near)
         # weighted mean of the paws; slipping ones lose weight
         square[..., :2] = (square[..., 0] + square[..., 1])[..., None]
         noise = cfg.paw_noise**2 + cfg.paw_scale**2 * (moved * moved).sum(-1)[..., None]

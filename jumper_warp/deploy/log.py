@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
 import numpy as np
 
 from jumper_warp.deploy.bundle import FILE, Bundle
-from jumper_warp.deploy.bus import Link
 from jumper_warp.deploy.runtime import TICK, Request, Runtime
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.utils.errors import InputError
@@ -51,22 +51,6 @@ def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
     return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), about
 
 
-class _Replayed(Link):
-    """Link that receives the frames of a log."""
-
-    def __init__(self, ticks: np.ndarray) -> None:
-        """Take the records of a log."""
-        super().__init__([])
-        self._records = iter(ticks)
-
-    def send(self, frames: np.ndarray) -> None:
-        """Send nothing."""
-
-    def collect(self) -> np.ndarray:
-        """Return the frames of the next tick."""
-        return next(self._records)["received"]
-
-
 def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
     """Run the runtime on the frames and requests of a log; return its ticks, and the first that differs, or -1.
 
@@ -74,7 +58,9 @@ def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
     """
     ticks, about = read_log(folder)
     source = MotionCapture() if about["capture"] else None
-    runtime = Runtime(bundle, _Replayed(ticks), source, rate=about["rate"])
+    received = iter(ticks["received"])
+    link: Any = SimpleNamespace(send=lambda frames: None, collect=lambda: next(received))
+    runtime = Runtime(bundle, link, source, rate=about["rate"])
     for number, logged in enumerate(ticks):
         ours = runtime.tick(Request(int(logged["request"])), logged["values"], float(logged["late"]))
         if ours.tobytes() != logged.tobytes():

@@ -23,36 +23,12 @@ from jumper_warp.deploy.sensors import UNKNOWN, MotionCapture, unpack_imu
 from jumper_warp.deploy.skills import Jump, Motion, Skill, Walk
 from jumper_warp.utils.errors import InputError
 
-
-class State(IntEnum):
-    """States of the robot."""
-
-    PASSIVE = 0  # motors off
-    STAND_UP = 1  # from any lying pose, after a confirmation
-    HOLD = 2  # stand in the default pose
-    WALK = 3
-    JUMP_UP = 4
-    JUMP_TO = 5
-    DAMP = 6  # motors brake
-    LANDING = 7  # a fault in flight: the landing pose until touchdown
-
-
-class Request(IntEnum):
-    """Requests of the operator."""
-
-    NONE = 0
-    PASSIVE = 1
-    STAND = 2  # enable the motors, which brake
-    CONFIRM = 3  # stand up
-    HOLD = 4
-    WALK = 5
-    JUMP_UP = 6
-    JUMP_TO = 7
-    STOP = 8
-    ZERO = 9  # make the present angle of a joint, values[0], its zero; in PASSIVE
-    JOINT = 10  # move a joint, values[0], and compare its reply; in HOLD, on a stand
-
-
+State = IntEnum("State", "PASSIVE STAND_UP HOLD WALK JUMP_UP JUMP_TO DAMP LANDING", start=0)
+"""States of the robot. PASSIVE: motors off; STAND_UP: from any lying pose, after a confirmation; HOLD: stand in the
+default pose; DAMP: motors brake; LANDING: a fault in flight, the landing pose until touchdown."""
+Request = IntEnum("Request", "NONE PASSIVE STAND CONFIRM HOLD WALK JUMP_UP JUMP_TO STOP ZERO JOINT", start=0)
+"""Requests of the operator. STAND enables the motors, which brake; CONFIRM stands up, and in HOLD tests legs' signs.
+ZERO makes the present angle of a joint, values[0], its zero, in PASSIVE; JOINT moves a joint, in HOLD on a stand."""
 SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to": (State.JUMP_TO, Jump)}
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
 JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
@@ -231,9 +207,9 @@ class Runtime:
         elif request in JUMP_OF_REQUEST and state in (State.WALK, State.HOLD):
             if JUMP_OF_REQUEST[request] in self.skills:
                 self.pending = (JUMP_OF_REQUEST[request], values)
-        if self.pending is not None and self._time >= self._due:
-            if state == State.HOLD or self.skill.ready_to_jump(self.motion):
-                self._enter(*self.pending)
+        due = self.pending is not None and self._time >= self._due
+        if due and (state == State.HOLD or self.skill.ready_to_jump(self.motion)):
+            self._enter(*self.pending)
 
     @property
     def skill(self) -> Any:
@@ -270,8 +246,7 @@ class Runtime:
             except InputError:
                 self._finite = False
             if self.skill.done:
-                back = State.WALK if State.WALK in self.skills and self.state != State.WALK else State.HOLD
-                self._enter(back)
+                self._enter(State.WALK if State.WALK in self.skills else State.HOLD)
                 self._act()
         elif isinstance(self._procedure, BallisticLanding):
             loaded = np.abs(self.torque[self.bundle.joints.transversal]).mean() > 3.0  # [N m]

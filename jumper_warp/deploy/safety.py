@@ -16,32 +16,16 @@ FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost fram
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
-class Fault(IntEnum):
-    """Faults that end a policy."""
-
-    NONE = 0
-    SILENT = 1  # a motor does not reply
-    BUS_OFF = 2  # a bus cannot send
-    ERROR_FRAME = 3  # many error frames
-    WRONG_ID = 4  # a frame of another id scheme
-    MOTOR_ERROR = 5  # a motor reports an error
-    TEMPERATURE = 6
-    TORQUE = 7  # a motor exceeds its torque limit, and the torque of its command
-    SPEED = 8
-    POSITION = 9
-    TILT = 10
-    STALE = 11  # the IMU sends nothing new
-    DIVERGED = 12  # the state source has no estimate
-    NOT_FINITE = 13  # the policy's action or observation is not finite
-    LATE = 14
-    STOP = 15  # the operator's stop
-    SIGN = 16  # a joint or a leg does not move as it should
-
-
-ACTING = {
-    Fault.WRONG_ID, Fault.MOTOR_ERROR, Fault.TEMPERATURE, Fault.SPEED, Fault.POSITION, Fault.TILT, Fault.STOP,
-    Fault.SIGN,
-}  # fmt: skip
+NAMES = (
+    "NONE", "SILENT", "BUS_OFF", "ERROR_FRAME", "WRONG_ID", "MOTOR_ERROR", "TEMPERATURE", "TORQUE", "SPEED", "POSITION",
+    "TILT", "STALE", "DIVERGED", "NOT_FINITE", "LATE", "STOP", "SIGN",
+)  # fmt: skip
+Fault = IntEnum("Fault", NAMES, start=0)
+"""Faults that end a policy. SILENT: a motor does not reply; BUS_OFF: a bus cannot send; ERROR_FRAME: many of them in a
+tick; WRONG_ID: a frame of another id scheme; TORQUE: a motor exceeds its torque limit and the torque of its command;
+STALE: the IMU sends nothing new; DIVERGED: the state is unknown; NOT_FINITE: action or observation of the policy; STOP:
+of the operator; SIGN: a joint or a leg does not move as it should."""
+ACTING = {Fault[name] for name in "WRONG_ID MOTOR_ERROR TEMPERATURE SPEED POSITION TILT STOP SIGN".split()}
 """Faults that end the policy at once."""
 
 
