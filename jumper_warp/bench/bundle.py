@@ -124,7 +124,7 @@ def bundle_onnx(policy: Policy) -> bytes:
 def runtime_archive() -> bytes:
     """Return the runtime as a zip archive that Python runs: `jumper_warp.deploy` and the modules that it imports."""
     package = Path(__file__).parents[1]
-    modules = [*sorted((package / "deploy").glob("*.py")), package / "policies" / "spec.py"]
+    modules = [*sorted((package / "deploy").glob("*.py")), package / "policies/spec.py"]
     modules += [package / "utils" / f"{name}.py" for name in ("checks", "errors", "files")]
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:

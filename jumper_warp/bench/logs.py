@@ -66,13 +66,14 @@ class LogCfg:
 def simulated_again(ticks: np.ndarray, rate: int) -> np.ndarray:
     """Return the joint coordinates (ticks, 43) of a simulation that gets a log's commands from its first pose on."""
     far = BusSim([], sim=make_simulation(1.0 / rate))
-    q = far.sim.joint_q()[0]
+    q = far.sim.joint_q()[0].copy()
     q[:3], q[3:7], q[MOTORS] = ticks["position"][0], ticks["quaternion"][0], ticks["angle"][0]
+    far.sim.state.joint_q.assign(q)
     result = np.empty((len(ticks), len(q)), np.float32)
     for number, frames in enumerate(ticks["sent"]):
         for motor, frame in enumerate(frames):
             far.take(motor, frame.tobytes())
-        result[number] = q
+        result[number] = far.sim.joint_q()[0]
         far.advance()
     return result
 

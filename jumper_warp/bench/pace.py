@@ -43,15 +43,11 @@ def serve_in_real_time(far: BusSim, seconds: float, latency: float) -> None:
             far.advance()
             for message in far.sensors():
                 heapq.heappush(pending, (occupy(0, now), next(order), 0, message))
-            due += far.dt
-            if now - due > 0.1:
-                due = now  # a pause: do not catch up
+            due = max(due + far.dt, now - 0.1)  # do not catch up after a pause
         wake = min(due, pending[0][0] if pending else due)
         for descriptor in select.select(list(descriptors), [], [], max(0.0, wake - time.monotonic()))[0]:
             number = descriptors[descriptor]
-            message = far.buses[number].recv(0.0)
-            if message is None:
-                continue
-            arrived = occupy(number, time.monotonic())
-            for reply in far.answer(number, message):
-                heapq.heappush(pending, (occupy(number, arrived + latency), next(order), number, reply))
+            if (message := far.buses[number].recv(0.0)) is not None:
+                arrived = occupy(number, time.monotonic())
+                for reply in far.answer(number, message):
+                    heapq.heappush(pending, (occupy(number, arrived + latency), next(order), number, reply))

@@ -37,9 +37,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     print(f"bus-sim on {cfg.bus}", flush=True)
     try:
         if cfg.lockstep:
-            for _ in range(round(cfg.seconds * cfg.rate)):
-                if not far.serve():
-                    break
+            all(far.serve() for _ in range(round(cfg.seconds * cfg.rate)))  # until the runtime ends
         else:
             serve_in_real_time(far, cfg.seconds, 1.0e-3 * cfg.latency)
     except KeyboardInterrupt:

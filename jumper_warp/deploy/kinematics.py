@@ -44,10 +44,7 @@ def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pitch = (shank[..., 1:].conj() * (INNER * knee_rate - ankle_rate)).imag / SHANK
     lateral = np.exp(1j * SIDE * angles[..., 0])
     across = lateral * (PLANE_Y + 1j * ankle.imag)  # y and z
-    position = np.empty(angles.shape)
-    position[..., 0] = ankle.real
-    position[..., 1] = across.real
-    position[..., 2] = across.imag
+    position = np.stack([ankle.real, across.real, across.imag], axis=-1)
     jacobian = np.zeros((*angles.shape, 3))
     jacobian[..., 1, 0] = -SIDE * across.imag
     jacobian[..., 2, 0] = SIDE * across.real

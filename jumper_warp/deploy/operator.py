@@ -1,4 +1,4 @@
-"""Requests of the operator: from the keyboard of a terminal, from a gamepad of Linux, or from a script."""
+"""Requests of the operator: from the keyboard of a terminal, or from a gamepad of Linux."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ w s a d q r  walk: faster ahead, back, left, right, turn left, turn right   x st
 j jump up    g jump to the place ahead"""
 STEP = 0.1  # [m/s], [rad/s] of a key
 JOYSTICK = struct.Struct("IhBB")  # time, value, type, number: an event of /dev/input/js0
-BUTTONS = {
-    0: Request.JUMP_UP, 1: Request.STOP, 2: Request.JUMP_TO, 3: Request.WALK, 6: Request.STAND, 7: Request.CONFIRM,
-}  # fmt: skip
+BUTTONS = {0: "JUMP_UP", 1: "STOP", 2: "JUMP_TO", 3: "WALK", 6: "STAND", 7: "CONFIRM"}  # requests
 AXES = {1: (0, -1.0), 0: (1, -0.5), 3: (2, -1.0)}  # component of the velocity and its value at full deflection
 
 Command = tuple[Request, tuple[float, ...]]  # with up to three values
@@ -32,9 +30,7 @@ NOTHING: Command = (Request.NONE, ())
 class Keyboard:
     """Requests from keys, and from a gamepad if there is one; `poll` never waits."""
 
-    KEYS: ClassVar = {
-        " ": Request.STOP, "p": Request.PASSIVE, "e": Request.STAND, "c": Request.CONFIRM, "h": Request.HOLD,
-    }  # fmt: skip
+    KEYS: ClassVar = {" ": "STOP", "p": "PASSIVE", "e": "STAND", "c": "CONFIRM", "h": "HOLD"}  # requests
     MOVES: ClassVar = {"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "r": (2, -1)}
 
     def __init__(self, height: float, place: Sequence[float], gamepad: str = "/dev/input/js0") -> None:
@@ -70,7 +66,7 @@ class Keyboard:
         elif key == "x":
             self._velocity = [0.0, 0.0, 0.0]
         else:
-            return self.KEYS.get(key, Request.NONE), ()
+            return Request[self.KEYS.get(key, "NONE")], ()
         return Request.WALK, tuple(self._velocity)
 
     def event(self, value: int, kind: int, number: int) -> Command:
@@ -80,7 +76,7 @@ class Keyboard:
             self._velocity[axis] = full * value / 32767
             return Request.WALK, tuple(self._velocity)
         if kind == 1 and value and number in BUTTONS:
-            request = BUTTONS[number]
+            request = Request[BUTTONS[number]]
             key = {Request.JUMP_UP: "j", Request.JUMP_TO: "g"}.get(request)
             return self._jumps[key] if key else (request, tuple(self._velocity))
         return NOTHING

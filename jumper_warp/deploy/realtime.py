@@ -15,14 +15,12 @@ SPIN = 1.0e-4  # [s] before each tick without sleeping; a loop without sleep wou
 PRIORITY = 80  # of SCHED_FIFO
 
 
-def request_real_time() -> bool:
-    """Give the process the real-time priority PRIORITY; without permission print a warning and return False."""
+def request_real_time() -> None:
+    """Give the process the real-time priority PRIORITY, or print a warning."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (PermissionError, AttributeError) as error:
         print(f"no real-time priority ({error}): ticks will be late; run with CAP_SYS_NICE", file=sys.stderr)
-        return False
-    return True
 
 
 def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict[str, Any]:
@@ -39,9 +37,7 @@ def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict
     gc.disable()
     try:
         while due - begin < seconds:
-            rest = due - time.monotonic() - SPIN
-            if rest > 0.0:
-                time.sleep(rest)
+            time.sleep(max(0.0, due - time.monotonic() - SPIN))
             while (now := time.monotonic()) < due:
                 pass
             tick(now - due)

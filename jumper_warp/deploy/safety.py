@@ -56,7 +56,6 @@ class Safety:
         """
         limits = self._limits
         self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
-        age = int(self._ages.max())
         strained = (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()
         sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
         beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
@@ -78,8 +77,7 @@ class Safety:
             (Fault.NOT_FINITE, not finite),
             (Fault.LATE, late > limits["max_late"]),
         )
-        fault = next((fault for fault, present in found if present), Fault.NONE)
-        self.ticks = max(self.ticks + 1, age) if fault else 0
-        self.fault = fault
+        self.fault = next((fault for fault, present in found if present), Fault.NONE)
+        self.ticks = max(self.ticks + 1, int(self._ages.max())) if self.fault else 0
         gone = late > (HOLD_TICKS + 1) * limits["max_late"] * 2.0
-        return fault in ACTING or self.ticks > HOLD_TICKS or gone
+        return self.fault in ACTING or self.ticks > HOLD_TICKS or gone

@@ -51,10 +51,10 @@ class Motion:
         self.stood = self.stood + 1 if estimate.contact.all() else 0
 
     @property
-    def yaw(self) -> float:
-        """Heading [rad]."""
-        ahead = rotate(self.estimate.quaternion, np.array([1.0, 0.0, 0.0]))
-        return float(np.arctan2(ahead[1], ahead[0]))
+    def heading(self) -> np.ndarray:
+        """Rotation (2, 2) of horizontal vectors from the robot's heading to the world."""
+        x, y, _ = rotate(self.estimate.quaternion, np.array([1.0, 0.0, 0.0]))
+        return np.array([[x, -y], [y, x]]) / np.hypot(x, y)
 
     @property
     def at_rest(self) -> bool:
@@ -119,8 +119,7 @@ class Walk(Skill):
     def ready_to_jump(self, motion: Motion) -> bool:
         """Return whether a jump may take over; until then stand, and walk a few steps now and then."""
         self.waited += 1
-        nudged = self.waited >= NUDGE_AFTER and self.waited % NUDGE_AFTER < NUDGE_STEPS
-        self.wanted = NUDGE if nudged else np.zeros(3)
+        self.wanted = NUDGE * (self.waited >= NUDGE_AFTER and self.waited % NUDGE_AFTER < NUDGE_STEPS)
         near = np.abs(motion.q - self.policy.default).max() < motion.switch["max_offset"]
         return bool(motion.at_rest and not self.velocity.any() and near)
 
@@ -131,11 +130,8 @@ class Jump(Skill):
     def begin(self, values: np.ndarray, motion: Motion) -> None:
         """Start squatting; values: height of the base at the apex [m], or place ahead and left of the base [m]."""
         super().begin(values, motion)
-        cosine, sine = np.cos(motion.yaw), np.sin(motion.yaw)
         self.height = float(values[0])
-        self.goal = motion.estimate.position[:2] + [
-            cosine * values[0] - sine * values[1], sine * values[0] + cosine * values[1]
-        ]  # fmt: skip
+        self.goal = motion.estimate.position[:2] + motion.heading @ values[:2]
         self.steps = 0
         self.landed = 0  # policy steps since landing
         self.phase = JumpCommand()
@@ -158,6 +154,4 @@ class Jump(Skill):
         elif not self.took_off and self.steps >= NO_JUMP_STEPS:
             self.done = True
         way = self.goal - motion.estimate.position[:2] if commanded else np.zeros(2)
-        cosine, sine = np.cos(motion.yaw), np.sin(motion.yaw)
-        goal = np.array([cosine * way[0] + sine * way[1], cosine * way[1] - sine * way[0]])
-        return {"wanted_height": self.height, "jump_command": flag, "goal": goal}
+        return {"wanted_height": self.height, "jump_command": flag, "goal": way @ motion.heading}

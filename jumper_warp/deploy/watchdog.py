@@ -43,13 +43,11 @@ def watch(pipe: int, other: int, spec: str, settings: dict[str, Any], silence: f
     brake(link, settings, damping_time)
 
 
-def brake(
-    link: Link, settings: dict[str, Any], damping_time: float, sleep: Callable[[float], Any] = time.sleep
-) -> None:
-    """Send damping commands for damping_time [s], then exit frames."""
+def brake(link: Link, settings: dict[str, Any], seconds: float, sleep: Callable[[float], Any] = time.sleep) -> None:
+    """Send damping commands for some seconds, then exit frames."""
     damping = np.array(settings["safety"]["damping"])
     frames = JointMap(settings).frames(np.zeros(12), np.zeros(12), damping)
-    for _ in range(max(1, round(damping_time / PERIOD))):
+    for _ in range(max(1, round(seconds / PERIOD))):
         link.send(frames)
         sleep(PERIOD)
     for _ in range(3):
