@@ -77,12 +77,17 @@ def wrong_scale(settings):
     settings["policies"]["horizontal_jump"]["observations"]["rate"]["scale"] = 0.05
 
 
+CHANGED = {degrees: "walking_flat", wrong_gain: "walking_flat", wrong_scale: "horizontal_jump"}  # other policies
+
+
 @pytest.mark.parametrize(
     "change", [swapped_pair, swapped_defaults, wrong_sign, degrees, wrong_gain, wrong_scale], ids=lambda f: f.__name__
 )
 def test_mistake_in_the_settings_fails_the_check(change, bundle_folder, tmp_path):
     folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
     settings = yaml.safe_load((folder / FILE).read_text())
+    name = CHANGED.get(change, "vertical_jump")
+    settings["policies"] = {name: settings["policies"][name]}
     change(settings)
     (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
     bundle = Bundle(folder)

@@ -18,7 +18,7 @@ SETTINGS = {
     "horizontal_jump": (jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter()),
     "walking_flat": (walking_motors(), walking_filter()),
 }
-WORLDS, STEPS = 50, 200  # 10,000 recorded steps of each policy
+WORLDS, STEPS = 50, 72  # 3,600 recorded steps of each policy, 10,800 of all
 
 
 @pytest.fixture(scope="module")
