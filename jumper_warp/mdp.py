@@ -17,6 +17,9 @@ functions with which an event writes a world's parameters. `mirror` has mirror i
 filters are in `jumper_warp.robot.motors`.
 """
 
+import inspect
+import re
+
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState, commanded, waiting
 from jumper_warp.kernels.mdp import mirror, observations, rewards, terminations
@@ -52,3 +55,8 @@ __all__ = [
     "walking_filter", "walking_motors", "world_ground",
     "write_default_pose", "yaw_of",
 ]  # fmt: skip
+
+for struct in (AttitudeState, Ground, JumpState, RobotArrays, RobotParameters, RobotView, Scene, VelocityState):
+    source = inspect.getsource(struct.cls)
+    fields = [": ".join(field) for field in re.findall(r"^    (\w+): .*?  # (.+)$", source, re.MULTILINE)]
+    struct.__doc__ = "\n".join([inspect.getdoc(struct.cls) or "", "", *fields])

@@ -184,7 +184,10 @@ def _verified(file: Path) -> bytes:
         checksums = content.get("sha256") if isinstance(content, dict) else None
     if isinstance(checksums, dict) and checksums.get(file.name) == hashlib.sha256(data).hexdigest():
         return data
-    raise InputError(f"{file}: damaged, or without checksum: write it again with jumper export")
+    raise InputError(
+        f"{file}: damaged, or copied without its manifest.json, which has its checksum; a file that needs no "
+        "manifest: jumper export POLICY --out FILE.onnx"
+    )
 
 
 def _interface(file: str | Path, metadata: Mapping[str, str]) -> dict[str, Any]:
