@@ -137,7 +137,7 @@ def errors(true: dict[str, np.ndarray], data: dict[str, np.ndarray], args: Args)
     found: dict[str, list] = {name: [] for name in names}
     for i in range(REST, len(data["q"])):
         readings = (data[name][i] for name in ("gyro", "accel", "q", "qd", "torque"))
-        estimate = estimator.update(*readings, float(true["dt"]))
+        estimate = estimator.update(*readings, dt=float(true["dt"]))
         pos, vel, rot, contact = (
             true[name][i + 1].repeat(args.num_draws, axis=0) for name in ("pos", "vel", "rot", "contact")
         )
@@ -175,7 +175,7 @@ def landing(contact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = np.zeros(contact.shape[1], dtype=int)
     best = np.zeros_like(length)
     last = np.zeros_like(length)
-    for i, touch in enumerate(contact.any(-1)):
+    for i, touch in enumerate(np.asarray(contact.any(-1))):
         length = np.where(touch, 0, length + 1)
         last = np.where(length > best, i, last)
         best = np.maximum(best, length)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,10 +41,11 @@ def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMot
             continue
         part = ticks[first + 1 : end]
         names = ("angle", "rate", "torque", "position", "quaternion")
+        columns: dict[str, Any] = {name: part[name].astype(float) for name in names}
         motion = RecordedMotion(
             f"{folder.name}_{State(int(state[first])).name.lower()}_{first}", time=np.arange(len(part)) / rate,
             target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
-            **{name: part[name].astype(float) for name in names}, torque_limit=torque_limit,
+            torque_limit=torque_limit, **columns,
             gains="walking" if state[first] == State.WALK else "jumping",
         )  # fmt: skip
         motions.append(motion)

@@ -37,7 +37,7 @@ class Bundle:
         if self.settings.get("version") != VERSION:
             raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
         self.joints = JointMap(self.settings)
-        self.curve = TorqueCurve(**{k: np.float32(v) for k, v in self.settings["torque_curve"].items()})
+        self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
         self.hold = Gains.from_yaml(self.settings["hold"])
         self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
         self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}

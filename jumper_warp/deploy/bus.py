@@ -94,8 +94,8 @@ def open_buses(spec: str, side: str = "host") -> list[can.BusABC]:
         if kind == "unix":
             Path(channel).mkdir(mode=0o700, parents=True, exist_ok=True)
             far = "robot" if side != "robot" else "host"
-            own = None if side == "watchdog" else side
-            return [UnixBus(own and Path(channel, f"{own}{i}"), Path(channel, f"{far}{i}")) for i in range(LEGS)]
+            own = {i: Path(channel, f"{side}{i}") for i in range(LEGS) if side != "watchdog"}
+            return [UnixBus(own.get(i), Path(channel, f"{far}{i}")) for i in range(LEGS)]
     except (can.CanError, OSError, ImportError, ValueError) as error:
         raise InputError(f"{spec}: {error}") from error
     raise InputError(f"bus must be socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER, got {spec!r:.60}")

@@ -198,7 +198,7 @@ class Estimator:
 
     def _correct(self, jacobian: np.ndarray, residual: np.ndarray, noise: np.ndarray) -> None:
         """Apply a Kalman update; jacobian (..., m, 15), residual (n, m), noise (n, m): variances."""
-        cross = jacobian @ self.cov
+        cross: np.ndarray = jacobian @ self.cov
         spread = cross @ jacobian.swapaxes(-1, -2)
         spread[:, range(noise.shape[-1]), range(noise.shape[-1])] += noise
         gain = np.linalg.solve(spread, cross).swapaxes(-1, -2)

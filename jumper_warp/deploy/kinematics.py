@@ -40,9 +40,9 @@ def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     det = np.where(np.abs(det) < 1.0e-4, np.copysign(1.0e-4, det), det)
     # rigid shanks: the ankle's velocity along each shank is that of its knee
     along = (shank.conj() * knee_rate).real / det[..., None]
-    ankle_rate = along * shank[..., ::-1] * ACROSS
+    ankle_rate: np.ndarray = along * shank[..., ::-1] * ACROSS
     pitch = (shank[..., 1:].conj() * (INNER * knee_rate - ankle_rate)).imag / SHANK
-    lateral = np.exp(1j * SIDE * angles[..., 0])
+    lateral: np.ndarray = np.exp(1j * SIDE * angles[..., 0])
     across = lateral * (PLANE_Y + 1j * ankle.imag)  # y and z
     position = np.stack([ankle.real, across.real, across.imag], axis=-1)
     jacobian = np.zeros((*angles.shape, 3))

@@ -54,7 +54,7 @@ class MotionTest:
 
         fails: whether the response of a part is wrong: of the joints (12,) [rad], of gravity in the body (3,).
         """
-        self._default, self._dt, self._offsets, self._fails = default, dt, np.float32(offsets), fails
+        self._default, self._dt, self._offsets, self._fails = default, dt, np.asarray(offsets, np.float32), fails
         self._ticks = round(TEST_TIMES[-1] / dt)
         self._tick = 0
         self.failed = False

@@ -207,9 +207,9 @@ class Runtime:
         elif request in JUMP_OF_REQUEST and state in (State.WALK, State.HOLD):
             if JUMP_OF_REQUEST[request] in self.skills:
                 self.pending = (JUMP_OF_REQUEST[request], values)
-        due = self.pending is not None and self._time >= self._due
-        if due and (state == State.HOLD or self.skill.ready_to_jump(self.motion)):
-            self._enter(*self.pending)
+        pending, due = self.pending, self._time >= self._due
+        if pending and due and (state == State.HOLD or self.skill.ready_to_jump(self.motion)):
+            self._enter(*pending)
 
     @property
     def skill(self) -> Any:

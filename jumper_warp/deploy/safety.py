@@ -16,11 +16,10 @@ FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost fram
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
-NAMES = (
+Fault = IntEnum("Fault", (
     "NONE", "SILENT", "BUS_OFF", "ERROR_FRAME", "WRONG_ID", "MOTOR_ERROR", "TEMPERATURE", "TORQUE", "SPEED", "POSITION",
     "TILT", "STALE", "DIVERGED", "NOT_FINITE", "LATE", "STOP", "SIGN",
-)  # fmt: skip
-Fault = IntEnum("Fault", NAMES, start=0)
+), start=0)  # fmt: skip
 """Faults that end a policy. SILENT: a motor does not reply; BUS_OFF: a bus cannot send; ERROR_FRAME: many of them in a
 tick; WRONG_ID: a frame of another id scheme; TORQUE: a motor exceeds its torque limit and the torque of its command;
 STALE: the IMU sends nothing new; DIVERGED: the state is unknown; NOT_FINITE: action or observation of the policy; STOP:
