@@ -6,6 +6,8 @@ the body frame (x forward, y left, z up). `jumper_warp.kernels.kinematics` has t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 FRONT = np.array([1.0, 1.0, -1.0, -1.0])
@@ -18,7 +20,6 @@ SHANK = 0.300  # [m]
 PAW_RADIUS = 0.025  # [m] sphere centred at the ankle
 OUTWARD = FRONT[:, None] * [1.0, -1.0]  # direction of outer and inner knee at positive angles
 ACROSS = np.array([-1j, 1j])  # turns a vector along the other shank to one across it
-INNER = np.array([0.0, 1.0])
 
 
 def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,9 +41,9 @@ def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     det = np.where(np.abs(det) < 1.0e-4, np.copysign(1.0e-4, det), det)
     # rigid shanks: the ankle's velocity along each shank is that of its knee
     along = (shank.conj() * knee_rate).real / det[..., None]
-    ankle_rate: np.ndarray = along * shank[..., ::-1] * ACROSS
-    pitch = (shank[..., 1:].conj() * (INNER * knee_rate - ankle_rate)).imag / SHANK
-    lateral: np.ndarray = np.exp(1j * SIDE * angles[..., 0])
+    ankle_rate: Any = along * shank[..., ::-1] * ACROSS
+    pitch = (shank[..., 1:].conj() * (knee_rate * [0.0, 1.0] - ankle_rate)).imag / SHANK
+    lateral: Any = np.exp(1j * SIDE * angles[..., 0])
     across = lateral * (PLANE_Y + 1j * ankle.imag)  # y and z
     position = np.stack([ankle.real, across.real, across.imag], axis=-1)
     jacobian = np.zeros((*angles.shape, 3))
