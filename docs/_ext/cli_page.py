@@ -9,6 +9,8 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from jumper_warp.bench.logs import LogCfg
+from jumper_warp.cli.bus_sim import BusSimCfg
 from jumper_warp.cli.compare import CompareCfg
 from jumper_warp.cli.doctor import DoctorCfg
 from jumper_warp.cli.drive import DriveCfg
@@ -27,6 +29,7 @@ from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP, TrainArgs
 from jumper_warp.cli.try_task import TryCfg
 from jumper_warp.cli.watch import WatchArgs
+from jumper_warp.deploy.main import parser as deploy_parser
 from jumper_warp.evaluation.agents import AgentCfg
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
@@ -61,7 +64,7 @@ def cli_page() -> str:
         of_kinds("play", ABOUT_PLAY,
                  {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
                  {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg),
-                  "Flags with --agent": list_flags(AgentCfg)}),
+                  "Flags with --log": list_flags(LogCfg), "Flags with --agent": list_flags(AgentCfg)}),
         section("drive POLICY ...", doc(DriveCfg), list_flags(DriveCfg)),
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
@@ -72,6 +75,8 @@ def cli_page() -> str:
         section("rescore RECORDING", doc(RescoreCfg), list_flags(RescoreCfg)),
         section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
+        f"## `jumper deploy BUNDLE`\n\n```text\n{deploy_parser().format_help()}```",
+        section("bus-sim", doc(BusSimCfg), list_flags(BusSimCfg)),
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
         section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
@@ -91,6 +96,7 @@ def summary() -> str:
         "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name",
         "compare": "compare-a-b", "rescore": "rescore-recording", "sweep": "sweep-file", "try": "try-file",
+        "deploy": "deploy-bundle",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()

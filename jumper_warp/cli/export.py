@@ -1,4 +1,4 @@
-"""`jumper export`: save a run's policy as a folder, a policy as one ONNX file, or a web page with policies."""
+"""`jumper export`: save a policy as a folder or one ONNX file, a bundle for the robot, or a web page with policies."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ class ExportCfg:
 
     sources: tyro.conf.Positional[tuple[str, ...]] = ()
     """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint; several
-    of them, or none, with --page."""
+    of them with --bundle, several or none with --page."""
     out: Path | None = None
     """ONNX file, or folder of the new policy (default: policy/ in the run's folder; of a policy <task>.onnx)."""
     newest: bool = False  # Export the newest checkpoint of a run, not the best
     overwrite: bool = False  # Replace an existing policy with its metrics and README
     page: Path | None = None
     """Folder of a static web page on which a visitor drives the robot, with these policies and the project's others."""
+    bundle: bool = False
+    """Write a folder for the robot: policies with their conformance vectors, deploy.yaml and the runtime deploy.pyz."""
     blend: tuple[str, float] | None = None
     """Second policy, and its weight, 0 to 1, in the weighted mean of both networks."""
 
@@ -61,8 +63,10 @@ def export(cfg: ExportCfg) -> Path:
 
     if cfg.page is not None:
         return export_page(cfg, cfg.page)
+    if cfg.bundle and cfg.sources:
+        return export_for_robot(cfg)
     if len(cfg.sources) != 1:
-        raise InputError("give one policy, or several with --page")
+        raise InputError("give one policy, or several with --page or --bundle")
     source = Path(newest_run(cfg.sources[0]))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out, cfg.overwrite)
@@ -110,3 +114,15 @@ def export_page(cfg: ExportCfg, folder: Path) -> Path:
     path = write_page(folder, [Policy.load(newest_run(source), newest=cfg.newest) for source in cfg.sources])
     print(path)
     return path
+
+
+def export_for_robot(cfg: ExportCfg) -> Path:
+    """Write a bundle of several policies, print its folder and return it. Raises InputError: see `export_bundle`."""
+    from jumper_warp.bench.bundle import export_bundle
+    from jumper_warp.policies.policy import Policy, checked_folder
+
+    folder = cfg.out or Path("bundle")
+    checked_folder(folder, cfg.overwrite)
+    named = [(Path(source).name.replace("-", "_"), Policy.load(source, newest=cfg.newest)) for source in cfg.sources]
+    print(export_bundle(named, folder))
+    return folder

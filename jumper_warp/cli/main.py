@@ -40,14 +40,16 @@ COMMANDS = {
     "try": "Train a changed task and its base briefly: jumper try FILE.py.",
     "sweep": "Optimise settings of a training: jumper sweep FILE.toml.",
     "rescore": "Evaluate changed rewards on a recorded motion.",
-    "export": "Save a policy, or the robot for other simulators.",
+    "export": "Save a policy, a bundle for the robot, or the robot for other simulators.",
+    "deploy": "Run policies on the robot: jumper deploy BUNDLE --bus BUS.",
+    "bus-sim": "Simulate the robot's motors and sensors on its CAN buses.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
     "doctor": "Check the installation: versions, and a step on each device.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules), see MODULES."""
-MODULES = {"try": "try_task"}  # Module of `jumper_warp.cli` by command, where their names differ
+MODULES = {"bus-sim": "bus_sim", "try": "try_task"}  # Module of `jumper_warp.cli` by command, where their names differ
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\

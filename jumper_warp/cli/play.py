@@ -1,6 +1,7 @@
 """`jumper play POLICY` records a policy for the Rerun viewer, `jumper play --script FILE` several policies in sequence.
 
 The policy comes first: its task decides which flags there are. A script lists the commands to one robot.
+`jumper play --log FOLDER` shows a log of the robot beside the simulation, and
 `jumper play --dump FILE` shows the state in which a term of a training was not finite.
 """
 
@@ -31,9 +32,10 @@ of the first one's task: policies, runs, or recordings (.rrd), of which each
 NAME=SOURCE has a name; of several robots the first one counts.
 jumper play TASK --agent zero|random|hold [flags] shows a task without a policy,
 and the range of each reward and the share of each termination.
+jumper play --log FOLDER [flags] shows a log of the robot beside the simulation.
 jumper play --dump FILE [flags] shows a state that a training has saved because a
 term was not finite."""
-SCRIPT, DUMP, AGENT = "--script", "--dump", "--agent"
+SCRIPT, DUMP, LOG, AGENT = "--script", "--dump", "--log", "--agent"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -47,6 +49,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         from jumper_warp.evaluation.commands import DumpCfg, play_dump
 
         play_dump(parse_flags(DumpCfg, f"play {DUMP} FILE", args))
+        return
+    if LOG in names:
+        from jumper_warp.bench.logs import LogCfg, play_log
+
+        play_log(parse_flags(LogCfg, f"play {LOG} FOLDER", args))
         return
     if SCRIPT in names:
         from jumper_warp.evaluation.commands import ScriptCfg, play_script

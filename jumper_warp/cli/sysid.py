@@ -25,7 +25,8 @@ usage: jumper sysid [fit] DATA ... [flags]
        jumper sysid excite [flags]
        jumper sysid actuator BENCH [flags]
 
-  DATA      recorded motions: npz, csv or parquet files, or folders of them
+  DATA      recorded motions: npz, csv or parquet files, folders of them, or
+            logs of jumper deploy
   excite    plan safe, informative motions and record them on a simulated robot
   actuator  limits, friction and latency of one motor from a test bench
 
@@ -140,7 +141,13 @@ def sysid(cfg: SysidCfg) -> None:
     settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std)]
     recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
-    motions = load_motions(cfg.data, gains=cfg.gain_preset, **recorded_with)
+    logs = [path for path in cfg.data if (path / "ticks.bin").is_file()]
+    files = [path for path in cfg.data if path not in logs]
+    motions = load_motions(files, gains=cfg.gain_preset, **recorded_with) if files else []
+    if logs:
+        from jumper_warp.bench.logs import motions_of_log
+
+        motions += [motion for log in logs for motion in motions_of_log(log, cfg.torque_limit or 18.0)]
     configure_device(cfg.device, cfg.threads)
     result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)

@@ -75,7 +75,7 @@ def test_checkpoint_of_the_command_line_is_exported_evaluated_and_played(tmp_pat
     args = "vertical-jump --trainer rsl-rl --num-envs 8 --max-iterations 1 --log-root runs --device cpu --ppo.hidden 16"
     run = train.run(args.split()).folder
     for source in (run, run / "model_0.pt"):
-        assert export.export(export.ExportCfg(str(source), overwrite=True)) == run / "policy"
+        assert export.export(export.ExportCfg((str(source),), overwrite=True)) == run / "policy"
     exported = Policy.load(run / "policy")
     obs = torch.randn(4, len(exported.mean))
     assert torch.equal(exported.act(obs), Policy.load(run / "model_0.pt").act(obs))

@@ -1,0 +1,68 @@
+"""Log of a run: every tick as a record of `runtime.TICK`, and every frame in a file of python-can."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import can
+import numpy as np
+
+from jumper_warp.deploy.bundle import FILE, Bundle
+from jumper_warp.deploy.runtime import TICK, Request, Runtime
+from jumper_warp.deploy.sensors import MotionCapture
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import read_file, read_json
+
+TICKS, ABOUT = "ticks.bin", "log.json"
+VERSION = 1
+
+
+class Log:
+    """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
+
+    def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
+        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv."""
+        folder.mkdir(parents=True, exist_ok=True)
+        about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
+        (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
+        (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
+        self._ticks = (folder / TICKS).open("wb")
+        self.frame = can.Logger(str(folder / frames))  # writes a frame, for `Link`
+
+    def tick(self, record: np.ndarray) -> None:
+        """Write the record of a tick."""
+        self._ticks.write(record.tobytes())
+
+    def close(self) -> None:
+        """Close the files."""
+        self._ticks.close()
+        self.frame.stop()
+
+
+def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
+    about = read_json(folder / ABOUT, "log of a robot")
+    if about.get("version") != VERSION or about.get("tick_bytes") != TICK.itemsize:
+        raise InputError(f"{folder / ABOUT}: written by another version of the runtime")
+    data = read_file(folder / TICKS, "ticks of a log")
+    return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), about
+
+
+def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
+    """Run the runtime on the frames and requests of a log; return its ticks, and the first that differs, or -1.
+
+    A log of a robot in PASSIVE from its first tick on replays bit for bit.
+    """
+    ticks, about = read_log(folder)
+    source = MotionCapture() if about["capture"] else None
+    received = iter(ticks["received"])
+    link: Any = SimpleNamespace(send=lambda frames: None, collect=lambda: next(received))
+    runtime = Runtime(bundle, link, source, rate=about["rate"])
+    for number, logged in enumerate(ticks):
+        ours = runtime.tick(Request(int(logged["request"])), logged["values"], float(logged["late"]))
+        if ours.tobytes() != logged.tobytes():
+            return len(ticks), number
+    return len(ticks), -1

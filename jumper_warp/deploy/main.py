@@ -1,0 +1,116 @@
+"""`jumper deploy BUNDLE` and `python deploy.pyz BUNDLE`: check a bundle, run the robot, or replay a log."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jumper_warp.deploy.bundle import Bundle
+from jumper_warp.deploy.bus import Link, open_buses
+from jumper_warp.deploy.check import check_bundle
+from jumper_warp.deploy.log import Log, replay
+from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
+from jumper_warp.deploy.realtime import request_real_time, run_loop
+from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.sensors import MotionCapture
+from jumper_warp.deploy.watchdog import Watchdog
+from jumper_warp.utils.errors import InputError
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    flags = argparse.ArgumentParser("jumper deploy", description="Run policies on the robot.", epilog=HELP)
+    flags.formatter_class = argparse.RawDescriptionHelpFormatter
+    flags.add_argument("bundle", type=Path, help="folder of jumper export POLICY ... --bundle")
+    flags.add_argument("--check", action="store_true", help="compare the bundle with its conformance vectors, and end")
+    flags.add_argument("--replay", type=Path, metavar="LOG", help="run a log through the runtime, and compare commands")
+    flags.add_argument("--bus", help="socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER")
+    flags.add_argument("--rate", type=int, choices=(480, 500), help="ticks a second (default: of deploy.yaml)")
+    flags.add_argument("--dry-run", action="store_true", help="compute commands, and keep the motors off")
+    flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
+    flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
+    flags.add_argument("--seconds", type=float, default=float("inf"), help="[s] end after this time")
+    flags.add_argument("--demo", action="store_true", help="stand up, walk and jump without an operator (bus-sim only)")
+    flags.add_argument("--height", type=float, default=0.7, help="[m] height of the base in jumps up (key j)")
+    flags.add_argument("--place", type=float, nargs=2, default=(0.5, 0.0), help="[m] ahead and left (key g)")
+    flags.add_argument("--log", type=Path, help="folder for the log")
+    return flags
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command; exits with 1 if a check fails, and with 2 and one line if the input is invalid."""
+    options = parser().parse_args(args)
+    try:
+        bundle = Bundle(options.bundle)
+        if bundle.edited:
+            print("deploy.yaml was edited after the export: check it with --check", file=sys.stderr)
+        if options.check:
+            differences = check_bundle(bundle)
+            print("\n".join(differences or [f"{len(bundle.policies)} policies conform"]))
+            raise SystemExit(bool(differences))
+        if options.replay is not None:
+            count, first = replay(options.replay, bundle)
+            print(f"{count} ticks repeat bit for bit" if first < 0 else f"tick {first} differs")
+            raise SystemExit(first >= 0)
+        if not options.bus:
+            raise InputError("--bus, --check or --replay is needed")
+        run(bundle, options)
+    except InputError as error:
+        print(f"jumper deploy: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+DEMO = (
+    (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
+    (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
+)  # fmt: skip
+"""Requests that let the robot stand up, walk and jump: time [s], request, values."""
+
+
+def run(bundle: Bundle, options: argparse.Namespace) -> None:
+    """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
+    rate = options.rate or int(bundle.settings["rate"])
+    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
+    pump = (lambda: None) if options.lockstep else None
+    link = Link(open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
+    source = MotionCapture() if options.capture else None
+    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    if log is not None:
+        link.listener, runtime.listener = log.frame, log.tick
+    dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
+    operator = Keyboard(options.height, options.place)
+    script = {round(at * rate): (request, values) for at, request, values in DEMO}
+    ticks, last = itertools.count(), State.PASSIVE
+
+    def tick(late: float) -> None:
+        """Run a tick with the operator's request, and print changes of the state."""
+        nonlocal last
+        runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
+        if dog is not None:
+            dog.beat()
+        if runtime.state != last:
+            last = runtime.state
+            print(f"{last.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
+
+    try:
+        with raw_terminal():
+            if options.lockstep:
+                for _ in range(round(options.seconds * rate)):
+                    tick(0.0)
+            else:
+                request_real_time()
+                print(json.dumps(run_loop(tick, rate, options.seconds)))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+            runtime.tick(request)
+        if dog is not None:
+            dog.close()
+        link.close()
+        if log is not None:
+            log.close()

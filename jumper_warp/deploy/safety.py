@@ -1,0 +1,82 @@
+"""Faults of the machine: how each is detected, and after how many ticks the robot leaves its policy.
+
+A fault of ACTING ends the policy in its first tick. With any other one the motors keep their last target for up to
+HOLD_TICKS ticks; in the next tick the policy ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost frame of a motor or of the IMU
+HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
+
+
+Fault = IntEnum("Fault", (
+    "NONE", "SILENT", "BUS_OFF", "ERROR_FRAME", "WRONG_ID", "MOTOR_ERROR", "TEMPERATURE", "TORQUE", "SPEED", "POSITION",
+    "TILT", "STALE", "DIVERGED", "NOT_FINITE", "LATE", "STOP", "SIGN",
+), start=0)  # fmt: skip
+"""Faults that end a policy. SILENT: a motor does not reply; BUS_OFF: a bus cannot send; ERROR_FRAME: many of them in a
+tick; WRONG_ID: a frame of another id scheme; TORQUE: a motor exceeds its torque limit and the torque of its command;
+STALE: the IMU sends nothing new; DIVERGED: the state is unknown; NOT_FINITE: action or observation of the policy; STOP:
+of the operator; SIGN: a joint or a leg does not move as it should."""
+ACTING = {Fault[name] for name in "WRONG_ID MOTOR_ERROR TEMPERATURE SPEED POSITION TILT STOP SIGN".split()}
+"""Faults that end the policy at once."""
+
+
+class Safety:
+    """Checks of every tick."""
+
+    def __init__(self, settings: Mapping[str, Any], transversal_sum: Sequence[float]) -> None:
+        """Read the section safety of deploy.yaml; transversal_sum: limits of outer + inner angle [deg]."""
+        self._limits = settings
+        lower, upper = np.radians(settings["lower"]), np.radians(settings["upper"])
+        margin = np.radians(settings["position_margin"])
+        self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
+        self._sum = np.radians(transversal_sum) + [-margin, margin]
+        self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
+        self.fault = Fault.NONE
+        self.ticks = 0  # for how long it has lasted
+
+    def check(
+        self, received: np.ndarray, q: np.ndarray, qd: np.ndarray, torque: np.ndarray, limit: np.ndarray,
+        temperature: np.ndarray, error: np.ndarray, *, tilt: float, stale: bool, diverged: bool, finite: bool,
+        late: float, stop: bool, sign: bool,
+    ) -> bool:  # fmt: skip
+        """Update `fault` and `ticks`, and return whether the policy must end.
+
+        received: record of the tick's frames. q, qd, torque, limit: (12,) [rad], [rad/s], [N m]. temperature [°C],
+        error: (12,). tilt: angle from upright [rad], 0 in flight. late: delay of the tick [s]. sign: whether a test of
+        signs has failed.
+        """
+        limits = self._limits
+        self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
+        strained = (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()
+        sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
+        beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
+        found = (
+            (Fault.STOP, stop),
+            (Fault.WRONG_ID, received["unknown"] > 0),
+            (Fault.MOTOR_ERROR, (error != 0).any()),
+            (Fault.TEMPERATURE, (temperature > limits["max_temperature"]).any()),
+            (Fault.SPEED, (np.abs(qd) > limits["max_rate"]).any()),
+            (Fault.POSITION, beyond),
+            (Fault.TILT, tilt > np.radians(limits["max_tilt"])),
+            (Fault.BUS_OFF, received["bus_off"].any()),
+            (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),
+            (Fault.SILENT, self._ages[:12].max() > 1),
+            (Fault.SIGN, sign),
+            (Fault.TORQUE, strained),
+            (Fault.STALE, self._ages[12] > 1),
+            (Fault.DIVERGED, diverged),
+            (Fault.NOT_FINITE, not finite),
+            (Fault.LATE, late > limits["max_late"]),
+        )
+        self.fault = next((fault for fault, present in found if present), Fault.NONE)
+        self.ticks = max(self.ticks + 1, int(self._ages.max())) if self.fault else 0
+        gone = late > (HOLD_TICKS + 1) * limits["max_late"] * 2.0
+        return self.fault in ACTING or self.ticks > HOLD_TICKS or gone

@@ -1,0 +1,178 @@
+"""Bundles: conformance vectors, ONNX metadata for other readers, and the runtime in a bare environment."""
+
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+from jumper_warp.bench.vectors import record_vectors
+from jumper_warp.deploy.bundle import FILE, Bundle
+from jumper_warp.deploy.check import check_bundle
+from jumper_warp.policies.policy import load_policy
+from jumper_warp.utils.assets import ASSETS
+from jumper_warp.utils.errors import InputError
+
+PACKAGES = ("numpy", "onnxruntime", "python-can", "PyYAML")
+
+
+def test_shipped_bundle_conforms(bundle):
+    assert check_bundle(bundle) == []
+    assert not bundle.edited
+
+
+def test_vectors_are_small():
+    files = [*(ASSETS / "conformance").iterdir()]
+    assert {file.suffix for file in files} == {".npz", ".json"} and len(files) == 6
+    assert max(file.stat().st_size for file in files) < 200_000
+
+
+def test_shipped_vectors_are_those_of_the_policy():
+    vectors = record_vectors(load_policy("vertical_jump"), episodes=1, steps=30)
+    with np.load(ASSETS / "conformance" / "vertical_jump.npz") as shipped:
+        assert np.abs(shipped["reading_angle"][:30] - vectors["reading_angle"]).max() < 1e-4
+        assert np.abs(shipped["action"][:30] - vectors["action"]).max() < 1e-3
+
+
+def swap(fields, first, second):
+    """Swap two entries of a list."""
+    fields[first], fields[second] = fields[second], fields[first]
+
+
+def swapped_pair(settings):
+    """Swap two motors in the joint map."""
+    swap(settings["joint_ids_map"], 1, 2)
+
+
+def swapped_defaults(settings):
+    """Swap the default angles of a lateral and an outer joint."""
+    swap(settings["policies"]["vertical_jump"]["actions"]["JointPositionAction"]["offset"], 0, 1)
+
+
+def wrong_sign(settings):
+    """Turn the sign of a joint."""
+    settings["joint_signs"][4] = -1
+
+
+def degrees(settings):
+    """Write action scales in degrees."""
+    action = settings["policies"]["walking_flat"]["actions"]["JointPositionAction"]
+    action["scale"] = np.degrees(action["scale"]).tolist()
+
+
+def wrong_gain(settings):
+    """Double a stiffness."""
+    settings["policies"]["walking_flat"]["stiffness"][3] = 34.0
+
+
+def wrong_scale(settings):
+    """Scale an observation."""
+    settings["policies"]["horizontal_jump"]["observations"]["rate"]["scale"] = 0.05
+
+
+CHANGED = {degrees: "walking_flat", wrong_gain: "walking_flat", wrong_scale: "horizontal_jump"}  # other policies
+
+
+@pytest.mark.parametrize(
+    "change", [swapped_pair, swapped_defaults, wrong_sign, degrees, wrong_gain, wrong_scale], ids=lambda f: f.__name__
+)
+def test_mistake_in_the_settings_fails_the_check(change, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    name = CHANGED.get(change, "vertical_jump")
+    settings["policies"] = {name: settings["policies"][name]}
+    change(settings)
+    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+    bundle = Bundle(folder)
+    assert check_bundle(bundle)
+    assert bundle.edited
+
+
+def test_stale_history_fails_the_check(bundle_folder, monkeypatch):
+    bundle = Bundle(bundle_folder)
+    policy = bundle.policies["vertical_jump"]
+    observe, readings = policy.observe, []
+
+    def stale(reading):
+        """Observe the readings of the step before."""
+        readings.append(reading)
+        return observe(readings[max(0, len(readings) - 2)])
+
+    monkeypatch.setattr(policy, "observe", stale)
+    assert any("observation" in line for line in check_bundle(bundle))
+
+
+def test_wrong_history_length_is_refused(bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    settings["policies"]["vertical_jump"]["observations"]["angle"]["history_length"] = 1
+    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+    with pytest.raises(InputError, match="history of 4"):
+        Bundle(folder)
+
+
+def test_swapped_onnx_file_is_refused(bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    shutil.copy(folder / "walking_flat.onnx", folder / "vertical_jump.onnx")
+    with pytest.raises(InputError, match="differs from its hash"):
+        Bundle(folder)
+
+
+def test_metadata_gives_other_readers_the_observation(bundle_folder):
+    """Their rule: names are terms; a term's history is stacked with the oldest frame first, flattened, and scaled."""
+    for name in ("vertical_jump", "horizontal_jump", "walking_flat"):
+        session = onnxruntime.InferenceSession(bundle_folder / f"{name}.onnx")
+        metadata = session.get_modelmeta().custom_metadata_map
+        columns = {key: value.split(",") for key, value in metadata.items()}
+        terms = columns["observation_names"]
+        history = list(map(int, columns["observation_terms_history_length"]))
+        for key in ("scale", "clip", "flatten_history_dim"):
+            assert len(list(map(float, columns[f"observation_terms_{key}"]))) == len(terms)
+        joints = columns["joint_names"]
+        widths = {"angle": 12, "rate": 12, "last_action": 12, "goal": 2} | dict.fromkeys(
+            ("command", "lin_vel", "ang_vel", "gravity"), 3
+        )
+        width = sum(widths.get(term, 1) * frames for term, frames in zip(terms, history, strict=True))
+        assert width == session.get_inputs()[0].shape[1]
+        assert len(joints) == 12 and set(columns["command_names"]) <= set(terms)
+        for key in ("joint_stiffness", "joint_damping", "default_joint_pos", "action_scale"):
+            assert len(list(map(float, columns[key]))) == 12
+
+
+def requirements(name, found):
+    """Add the distribution of a package, and those that it requires, to `found`."""
+    key = name.lower().replace("-", "_")
+    if key in found:
+        return
+    try:
+        found[key] = importlib.metadata.distribution(name)
+    except importlib.metadata.PackageNotFoundError:
+        return
+    for line in found[key].requires or ():
+        requirement = Requirement(line)
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            requirements(requirement.name, found)
+
+
+def test_archive_runs_in_an_environment_with_four_packages(bundle_folder, tmp_path):
+    found = {}
+    for name in PACKAGES:
+        requirements(name, found)
+    assert not {"torch", "warp_lang", "newton", "onnx"} & set(found)
+    for distribution in found.values():
+        for top in {file.parts[0] for file in distribution.files if file.parts[0] not in ("..", "__pycache__")}:
+            source = Path(distribution.locate_file(top))
+            if source.exists() and not (tmp_path / top).exists():
+                (tmp_path / top).symlink_to(source)
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-S", "deploy.pyz", ".", "--check"]
+    done = subprocess.run(command, cwd=bundle_folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "3 policies conform\n"

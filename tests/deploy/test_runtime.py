@@ -1,0 +1,122 @@
+"""The runtime on simulated buses in lockstep: standing up, walking, jumping, and replaying the log."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jumper_warp.bench.bus_sim import BusFaults
+from jumper_warp.deploy.estimator import Estimator
+from jumper_warp.deploy.log import Log, read_log, replay
+from jumper_warp.deploy.motions import joint_test
+from jumper_warp.deploy.runtime import Request, State
+
+
+def run_until(robot, state, ticks=4000):
+    """Run until a state, at most some ticks; return the greatest height of the base [m]."""
+    height = 0.0
+    for _ in range(ticks):
+        robot.run(1)
+        height = max(height, robot.far.q[2])
+        if robot.runtime.state == state:
+            return height
+    raise AssertionError(f"in state {robot.runtime.state.name}, not {state.name}: {robot.runtime.reason.name}")
+
+
+def test_walk_and_jump_to_a_place_replay_bit_for_bit(make_robot, bundle, tmp_path):
+    log = Log(tmp_path / "log", bundle, 480, capture=True, frames="frames.asc")
+    robot = make_robot()
+    robot.runtime.listener = log.tick
+    robot.link.listener = log.frame
+    robot.run(3)
+    assert robot.runtime.state == State.PASSIVE and not robot.far.enabled.any()
+    robot.run(150, Request.STAND)
+    assert robot.runtime.state == State.STAND_UP and robot.far.enabled.all()
+    assert robot.far.q[2] < 0.3  # [m] it waits for the confirmation
+    robot.run(1, Request.CONFIRM)
+    run_until(robot, State.HOLD)
+    assert robot.far.q[2] > 0.3
+    robot.run(360, Request.WALK, (0.5, 0.0, 0.0))
+    assert robot.far.velocity[0] > 0.3  # [m/s]
+    robot.run(1, Request.JUMP_TO, (0.5, 0.1, 0.0))
+    run_until(robot, State.JUMP_TO)
+    goal = robot.runtime.skill.goal
+    run_until(robot, State.WALK)
+    assert np.linalg.norm(robot.far.q[:2] - goal) < 0.1  # [m]
+    log.close()
+    count, first = replay(tmp_path / "log", bundle)
+    assert count > 3000 and first == -1
+    assert (tmp_path / "log" / "frames.asc").stat().st_size > 1e5  # bytes
+    changed = read_log(tmp_path / "log")[0].copy()
+    changed["received"]["motor"][1000, 3, 2] ^= 1
+    (tmp_path / "log" / "ticks.bin").write_bytes(changed.tobytes())
+    assert replay(tmp_path / "log", bundle)[1] >= 1000
+
+
+@pytest.mark.parametrize(
+    ("faults", "tolerance"),
+    [
+        ({}, 0.03), ({"drop": 0.01, "seed": 1}, 0.1), ({"delay": 0.5}, 0.1),
+        ({"gyro_noise": 5e-3, "accel_noise": 0.05}, 0.05),
+    ],
+    ids=["no fault", "1 % of frames lost", "a tick of jitter", "estimator and noise"],
+)  # fmt: skip
+def test_jump_up_over_the_bus_reaches_its_height(faults, tolerance, make_robot):
+    robot = make_robot(BusFaults(**faults), Estimator() if "gyro_noise" in faults else None)
+    robot.stand()
+    robot.run(1, Request.JUMP_UP, (0.8, 0.0, 0.0))
+    assert run_until(robot, State.WALK) == pytest.approx(0.8, abs=tolerance)  # [m]
+    robot.run(120)
+    assert robot.runtime.state == State.WALK and robot.far.q[2] > 0.2
+
+
+def test_dry_run_keeps_the_motors_off(make_robot):
+    robot = make_robot(dry_run=True)
+    robot.run(3)
+    records = robot.run(50, Request.STAND)
+    assert robot.runtime.state == State.STAND_UP
+    assert not robot.far.enabled.any() and (records[-1]["sent"] == robot.runtime.off).all()
+
+
+def test_zeroing_makes_the_angle_of_one_joint_its_offset(make_robot):
+    robot = make_robot()
+    before = robot.run(3)[-1]["angle"]
+    robot.run(2, Request.ZERO, (4.0,))
+    after = robot.run(2)[-1]["angle"]
+    assert robot.runtime.state == State.PASSIVE and robot.far.zero[4] != 0.0
+    assert after[4] == pytest.approx(0.0, abs=0.01)  # [rad]
+    assert np.delete(after, 4) == pytest.approx(np.delete(before, 4), abs=0.01)
+
+
+@pytest.mark.parametrize(("follows", "fails"), [(3, False), (None, True), (4, True)])
+def test_joint_test_fails_unless_the_joint_alone_follows(follows, fails, bundle):
+    test = joint_test(bundle.default, 3, 1.0 / 480.0)
+    q, largest = bundle.default.copy(), 0.0
+    while not test.done:
+        target = test.step(SimpleNamespace(q=q, gravity=np.zeros(3)))
+        largest = max(largest, target[3])
+        q = bundle.default.copy()
+        if follows is not None:
+            q[follows] += target[3] - bundle.default[3]
+    assert test.failed == fails
+    assert largest - bundle.default[3] == pytest.approx(0.15)  # [rad]
+    assert target == pytest.approx(bundle.default)
+
+
+def test_joint_of_a_request_moves(make_robot):
+    robot = make_robot()
+    robot.stand()
+    targets = np.array([record["target"] for record in robot.run(150, Request.JOINT, (4.0,))])
+    assert np.flatnonzero(np.ptp(targets, axis=0) > 0.1).tolist() == [4]
+
+
+def test_policy_acts_every_eighth_or_ninth_tick_at_500_hz(make_robot):
+    robot = make_robot(rate=500)
+    robot.stand()
+    robot.run(1, Request.WALK)
+    acted = []
+    targets = robot.runtime.skill.targets
+    robot.runtime.skill.targets = lambda motion: acted.append(tick) or targets(motion)
+    for tick in range(100):  # noqa: B007
+        robot.run(1)
+    assert set(np.diff(acted)) == {8, 9} and len(acted) == 12
