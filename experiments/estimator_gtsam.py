@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import gtsam
+import gtsam  # pyright: ignore[reportMissingImports] not a dependency
 import numpy as np
 
 FEET = ("FL", "FR", "BL", "BR")
