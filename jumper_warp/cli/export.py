@@ -92,11 +92,17 @@ def export(cfg: ExportCfg) -> Path:
 
 
 def files_for_page(policy: Policy, name: str) -> dict[str, bytes]:
-    """Return a policy's files for the web page, content by name; if the page cannot run it, print why and return {}."""
+    """Return a policy's files for the web page, content by name; if the page cannot run it, print why and return {}.
+
+    Nothing is printed for a user's task, whose file is not needed here.
+    """
     from jumper_warp.live.site import browser_files
+    from jumper_warp.tasks.saving import TaskError
 
     try:
         return browser_files(policy, name)
+    except TaskError:
+        return {}
     except InputError as error:
         print(f"without files for the web page: {error}", file=sys.stderr)
         return {}

@@ -6,10 +6,12 @@ is four times slower and draws neither lines nor transparency.
 
 from __future__ import annotations
 
+import importlib
 import math
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -257,6 +259,8 @@ def _gl_viewer(size: tuple[int, int]) -> Any:
     """
     import pyglet
 
+    with suppress(ImportError):  # its LLVM must be loaded before that of Mesa, or importing it later crashes
+        importlib.import_module("triton")
     pyglet.options["headless"] = True  # read when pyglet's window module is first imported
     try:
         return newton.viewer.ViewerGL(width=size[0], height=size[1], headless=True)

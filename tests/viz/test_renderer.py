@@ -2,6 +2,9 @@
 
 import math
 import os
+import subprocess
+import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -22,6 +25,13 @@ FOCAL = 0.5 * SIZE[1] / math.tan(math.radians(20.0))  # [px]
 def poses(*positions):
     """Return poses (n, 7) of bodies at positions [m], not turned."""
     return np.array([[*position, 0.0, 0.0, 0.0, 1.0] for position in positions])
+
+
+DRAW_THEN_IMPORT = """
+from jumper_warp.viz.renderer import GLRenderer
+GLRenderer([], 0, (96, 64)).close()
+import triton
+"""  # as a notebook that draws a picture and then trains
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +129,12 @@ def test_arrow_has_its_head_at_the_last_point(opengl):
         columns = np.nonzero(colored(renderer.draw(poses((0.0, 0.0, 0.0)), VIEW, [line]), BLUE))[1]
     start, *_, end = np.array_split(np.bincount(columns)[columns.min() :], 10)  # [px] thickness along the arrow
     assert end.max() >= 2 * start.max()
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="needs triton")
+def test_triton_can_be_imported_after_a_picture(opengl):
+    result = subprocess.run([sys.executable, "-c", DRAW_THEN_IMPORT], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 def test_points_behind_the_eye_have_no_pixel():
