@@ -20,6 +20,7 @@ import numpy as np
 from jumper_warp.deploy.bundle import JointMap
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.codec import EXIT
+from jumper_warp.utils.errors import InputError
 
 SILENCE = 0.02  # [s] without a tick after which the watchdog acts
 DAMPING_TIME = 2.0  # [s]
@@ -29,18 +30,24 @@ PERIOD = 0.002  # [s] between damping commands
 def watch(pipe: int, other: int, spec: str, settings: dict[str, Any], silence: float, damping_time: float) -> None:
     """Wait until the pipe (a file descriptor) closes or is silent, then brake and switch the motors off.
 
+    The first byte begins the watch, since the runtime needs time to start. A byte `q` ends it without that.
+
     other: the end of the pipe that the runtime writes to. spec: of the buses, see `open_buses`. settings: of
-    deploy.yaml. A byte `q` on the pipe ends the watch without that.
+    deploy.yaml.
     """
     os.close(other)
     os.setsid()  # signals of the terminal do not reach it
     link = Link(open_buses(spec, "watchdog"))
-    while select.select([pipe], [], [], silence)[0]:
-        if not (data := os.read(pipe, 4096)):
-            break
+    timeout = None
+    while select.select([pipe], [], [], timeout)[0]:
+        timeout = silence
+        data = os.read(pipe, 4096)
         if b"q" in data:
-            return
+            os._exit(0)  # without destructors of the runtime's buses
+        if not data:
+            break
     brake(link, settings, damping_time)
+    os._exit(0)
 
 
 def brake(link: Link, settings: dict[str, Any], seconds: float, sleep: Callable[[float], Any] = time.sleep) -> None:
@@ -70,12 +77,16 @@ class Watchdog:
         os.close(reader)
 
     def beat(self) -> None:
-        """Report that the runtime has done a tick."""
-        with suppress(BlockingIOError):
-            os.write(self._writer, b".")
+        """Report that the runtime has done a tick. Raises InputError: the watchdog has switched the motors off."""
+        try:
+            with suppress(BlockingIOError):
+                os.write(self._writer, b".")
+        except BrokenPipeError:
+            raise InputError("the watchdog has switched the motors off: no tick for too long") from None
 
     def close(self) -> None:
         """End the watch of a runtime that has switched its motors off."""
-        os.write(self._writer, b"q")
+        with suppress(BrokenPipeError):
+            os.write(self._writer, b"q")
         os.close(self._writer)
         self.process.join()

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import can
@@ -15,7 +16,8 @@ from jumper_warp.bench.bus_sim import BusFaults
 from jumper_warp.deploy.bus import Link
 from jumper_warp.deploy.runtime import Request, State
 from jumper_warp.deploy.safety import HOLD_TICKS, Fault
-from jumper_warp.deploy.watchdog import brake
+from jumper_warp.deploy.watchdog import Watchdog, brake
+from jumper_warp.utils.errors import InputError
 
 
 class OffBus:
@@ -221,6 +223,19 @@ def test_watchdog_brakes_and_switches_off_when_the_runtime_is_killed(make_robot,
         frames = np.array([list(message.data)] * 12, dtype=np.uint8)
         _, _, kp, kd, _ = robot.far.codec.decode_command(frames)
         assert (kp == 0.0).all() and kd == pytest.approx(2.0, abs=1e-3)
+
+
+def test_watch_begins_with_the_first_tick_and_its_end_is_reported(bundle, make_robot, tmp_path):
+    make_robot()
+    dog = Watchdog(f"unix:{tmp_path}", bundle.settings, silence=0.02, damping_time=0.02)
+    time.sleep(0.5)
+    assert dog.process.is_alive()
+    dog.beat()
+    dog.process.join(60.0)
+    assert dog.process.exitcode == 0
+    with pytest.raises(InputError, match="the watchdog has switched the motors off"):
+        dog.beat()
+    dog.close()
 
 
 def test_braking_damps_the_motors_then_switches_them_off(make_robot, bundle):
