@@ -101,10 +101,9 @@ def files_for_page(policy: Policy, name: str) -> dict[str, bytes]:
 
     try:
         return browser_files(policy, name)
-    except TaskError:
-        return {}
     except InputError as error:
-        print(f"without files for the web page: {error}", file=sys.stderr)
+        if not isinstance(error.__cause__, TaskError):
+            print(f"without files for the web page: {error}", file=sys.stderr)
         return {}
 
 

@@ -11,11 +11,13 @@ import warp as wp
 from cli_helpers import run
 from jumper_warp.envs import term_check
 from jumper_warp.envs.env import Env
+from jumper_warp.utils.runtime import init_warp
 
 
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
-    """Restore Warp's log level after a test."""
+    """Restore Warp's log level after a test, to what it is once Warp runs."""
+    init_warp()
     monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)
 
 
