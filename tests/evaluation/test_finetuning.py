@@ -159,14 +159,13 @@ def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():
 
 
 def test_correct_aim_removes_constant_overshoot():
-    """A policy that observes goals 40 mm too far misses by less than the original after the correction alone."""
-    # 16 goals: with 8, a single jump that slips can outweigh the others, and no aim correction is chosen
-    policy, cfg = Policy.load("slippery_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
-    untouched = jump_errors(make_groups(policy.recipe(), cfg)[0], Network(policy), derivatives=False).value
+    """A policy that observes goals 40 mm too far misses by a quarter of that at most after the correction alone."""
+    policy, cfg = Policy.load("horizontal_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
-    assert last["mean_abs_miss_m"]["nominal"] < float(untouched.abs().mean()) and len(record["steps"]) == 1
+    assert last["mean_abs_miss_m"]["nominal"] < 0.25 * first["mean_abs_miss_m"]["nominal"]
+    assert len(record["steps"]) == 1
     for mine, theirs in zip(aimed.layers, policy.layers, strict=True):
         assert torch.equal(mine[0], theirs[0]) and torch.equal(mine[1], theirs[1])
     assert not torch.equal(aimed.mean, policy.mean)
