@@ -33,6 +33,7 @@ SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
 JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
 DRIVERLESS = (State.PASSIVE, State.DAMP, State.LANDING)  # states that a fault does not end
+ENTER_TICKS = 5  # in each of which the motors are switched on, since a frame can be lost
 REST_TICKS = 96  # over which the readings of a robot at rest are averaged
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
 TICK = np.dtype([
@@ -73,6 +74,7 @@ class Runtime:
             self.skills[state] = kind(policy, Gains.from_yaml(fields), fields["commands"])
         self.damping = np.array(settings["safety"]["damping"], dtype=np.float32)
         self.off = np.tile(np.frombuffer(EXIT, np.uint8), (12, 1))
+        self.enter = np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
         self.frames = self.off
         self.state = State.PASSIVE
         self.reason = Fault.NONE
@@ -86,6 +88,7 @@ class Runtime:
         self._driven = (self._target, 0.0 * self.damping, 0.0 * self.damping)  # target, kp, kd of the next frames
         self._asked = np.zeros(12)  # [N m] torque that the last frames asked for
         self._contact = np.zeros(4, bool)
+        self._enter_ticks = 0  # ticks for which the motors are still to be switched on
         self._rest, self._rest_ticks = np.zeros(18), 0  # mean of gyro, accelerometer and angles in PASSIVE
         self._time, self._due = 0, 0  # of the tick, and of the next policy step
         self._step, self._policy_step = CLOCK // rate, CLOCK // 60
@@ -179,7 +182,8 @@ class Runtime:
             self.reason = self.safety.fault
             if not self.reason:
                 self._enter(State.STAND_UP)
-                return np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
+                self._enter_ticks = ENTER_TICKS
+                return self._commands()
         return self.off
 
     def _requests(self, request: Request, values: np.ndarray) -> None:
@@ -260,6 +264,9 @@ class Runtime:
         """Return the frames of the present targets, within the torque limits of the joints at the next tick."""
         if self.state == State.PASSIVE:
             return self.off
+        if self.state == State.STAND_UP and self._enter_ticks:
+            self._enter_ticks -= 1
+            return self.enter
         if self.state == State.DAMP or (self.state == State.STAND_UP and self._procedure is None):
             self._driven = (self.q, 0.0 * self.damping, self.damping)
         else:

@@ -41,7 +41,7 @@ class Robot:
     def stand(self):
         """Enable the motors of a robot that stands already, and hold."""
         self.run(3)
-        self.run(2, Request.STAND)
+        self.run(6, Request.STAND)
         self.runtime._enter(State.HOLD)
         self.run(48)
 

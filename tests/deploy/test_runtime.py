@@ -56,7 +56,7 @@ def test_walk_and_jump_to_a_place_replay_bit_for_bit(make_robot, bundle, tmp_pat
 @pytest.mark.parametrize(
     ("faults", "tolerance"),
     [
-        ({}, 0.03), ({"drop": 0.01, "seed": 1}, 0.1), ({"delay": 0.5}, 0.1),
+        ({}, 0.03), ({"drop": 0.01}, 0.1), ({"delay": 0.5}, 0.1),
         ({"gyro_noise": 5e-3, "accel_noise": 0.05}, 0.05),
     ],
     ids=["no fault", "1 % of frames lost", "a tick of jitter", "estimator and noise"],
@@ -68,6 +68,16 @@ def test_jump_up_over_the_bus_reaches_its_height(faults, tolerance, make_robot):
     assert run_until(robot, State.WALK) == pytest.approx(0.8, abs=tolerance)  # [m]
     robot.run(120)
     assert robot.runtime.state == State.WALK and robot.far.q[2] > 0.2
+
+
+def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
+    """With one frame each, 0.9^12 = 28 % of robots would have all motors on."""
+    for seed in range(5):
+        robot = make_robot(BusFaults(drop=0.1, seed=seed))
+        while robot.runtime.state == State.PASSIVE:
+            robot.run(1, Request.STAND)
+        robot.run(6)
+        assert robot.far.enabled.all()
 
 
 def test_dry_run_keeps_the_motors_off(make_robot):
