@@ -30,7 +30,7 @@ from jumper_warp.utils.metrics import MetricValue, unit_of
 from support.policy_results import CONDITIONS, METRICS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
 from support.scripts import run_script
 
-BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. -]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- table: (?P<name>choice|\w+ [\w. -]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 TABLES: dict[str, Json] = PAGES["tables"]  # Tables of tests by name
 SHOWN = {"nominal": "nominal", "randomised": "randomised", "mujoco": "SolverMuJoCo", "friction_0.4": "friction 0.4"}
 """Conditions in a policy's main table, and their titles there."""
@@ -201,10 +201,18 @@ def key_table(name: str) -> str:
 
 
 def measured_table(name: str) -> str:
-    """Return a table of MEASURED, with the machine, commit and date of each row."""
+    """Return a table of MEASURED, with machine, commit and date of each row, or below if all rows have the same."""
     table = MEASURED[name]
-    lines = [[*row["cells"], row["machine"], f"{row['commit']}, {row['date']}"] for row in table["rows"]]
-    return markdown((*table["columns"], "machine", "commit"), lines)
+    rows = table["rows"]
+    origins = {
+        "machine": [row["machine"] for row in rows],
+        "commit": [f"{row['commit']}, {row['date']}" for row in rows],
+    }
+    shared = [values[0] for values in origins.values() if len(set(values)) == 1]
+    varying = {title: values for title, values in origins.items() if len(set(values)) > 1}
+    lines = [[*row["cells"], *(values[i] for values in varying.values())] for i, row in enumerate(rows)]
+    text = markdown((*table["columns"], *varying), lines)
+    return text + (f"\nMeasured: {', '.join(shared)}.\n" if shared else "")
 
 
 def recipe_table(task: str) -> str:
@@ -268,8 +276,10 @@ def _success(row: Row, kind: str) -> str:
 
 def pages() -> list[Path]:
     """Return the paths of the documentation pages and policies' READMEs that may have generated tables."""
-    return [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "reference/metrics.md",
-            RESULTS.parent / "explanation/robot.md", *sorted(POLICIES.glob("*/README.md"))]  # fmt: skip
+    docs = RESULTS.parent
+    own = [path for folder in ("results", "reference", "explanation", "howto", "tutorials")
+           for path in sorted(docs.glob(f"{folder}/*.md"))]  # fmt: skip
+    return [*own, *sorted(POLICIES.glob("*/README.md"))]
 
 
 def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
