@@ -338,15 +338,16 @@ class Farthest(Suite):
         errors = np.array([np.where(o.success, o.distance_at_rest_m, np.nan)[:, 0] for o in outcomes])
         conditions = f"{run.title}, {self.num_jumps} jumps each"
         values = distance_metrics(bins)
+        covered: dict[str, Any] = {
+            "from paws to paws": values["bin_paw_to_paw_distance_mean_m"].value,
+            "flown by the base": values["bin_distance_flown_mean_m"].value,
+        }
         plot_distances(
             run.folder / "max_jump.png",
             [*bins],
             successes,
             errors,
-            covered={
-                "from paws to paws": values["bin_paw_to_paw_distance_mean_m"].value,
-                "flown by the base": values["bin_distance_flown_mean_m"].value,
-            },
+            covered=covered,
             reliable=RELIABLE,
             published=PUBLISHED,
             conditions=conditions,
