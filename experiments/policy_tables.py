@@ -1,18 +1,23 @@
-"""Make the tables in docs/ and the policies' pages from the policies' metrics.json; nothing is simulated.
+"""Make the tables in docs/ and the policies' pages from files with metrics; nothing is simulated.
 
     python experiments/policy_tables.py
 
-A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`
-or `choice`. `policy_pages.toml` defines columns and tests.
+A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`,
+`choice`, `measured NAME` or `recipe TASK`. `policy_pages.toml` defines columns and tests of policies; their values come
+from the policies' metrics.json. `measured` tables come from docs/results/measurements.json, whose rows have a machine,
+a commit and a date. `recipe` tables come from the trainings of the paper's recipe in docs/results/paper.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jumper_warp.evaluation.attitude import TURN_METRICS
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS, PLACE_METRICS
@@ -22,10 +27,10 @@ from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.metrics import MetricValue, unit_of
-from support.policy_results import CONDITIONS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
+from support.policy_results import CONDITIONS, METRICS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
 from support.scripts import run_script
 
-BLOCK = re.compile(r"(<!-- table: (?P<name>[\w. ]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- table: (?P<name>choice|\w+ [\w. -]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 TABLES: dict[str, Json] = PAGES["tables"]  # Tables of tests by name
 SHOWN = {"nominal": "nominal", "randomised": "randomised", "mujoco": "SolverMuJoCo", "friction_0.4": "friction 0.4"}
 """Conditions in a policy's main table, and their titles there."""
@@ -43,6 +48,10 @@ ERRORS = {
     "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
 }
 """Key of the error, factor and format by kind."""
+MEASURED: dict[str, Json] = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))["tables"]
+ARMS = {"full": "full", "no_initialisation": "no initialisation", "no_estimates": "no estimates",
+        "no_curriculum": "no curriculum"}  # fmt: skip
+"""Titles of the trainings in docs/results/paper, by the beginning of their folders' names."""
 Results = Mapping[str, MetricValue]  # Metrics by key
 
 
@@ -88,6 +97,8 @@ def number(key: str, value: Any) -> str:
         return "–"
     if key.endswith("_rate"):
         return f"{100.0 * value:.1f} %"
+    if key.startswith(("reliable_distance_flown", "reliable_paw")):
+        return f"{value:.2f}"
     if key.startswith("reliable_") or unit_of(key) == "N":
         return f"{value:.1f}"
     return f"{value:.2f}" if key.endswith(("_s", "_deg")) and "rmse" not in key else f"{value:.4f}"
@@ -102,7 +113,7 @@ def cell(column: Sequence[str], metrics: Results) -> str:
             text.append(number(key, metric.value))
             interval = metric.interval if key.startswith("±") else interval
     limits = "" if interval is None else " ({} to {})".format(*(f"{100.0 * limit:.1f}" for limit in interval))
-    return " / ".join(text) + limits
+    return ("–" if set(text) == {"–"} else " / ".join(text)) + limits
 
 
 def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
@@ -189,6 +200,46 @@ def key_table(name: str) -> str:
     return markdown(("key", "unit", "statistic", "over"), lines)
 
 
+def measured_table(name: str) -> str:
+    """Return a table of MEASURED, with machine, commit and date of each row, or below if all rows have the same."""
+    table = MEASURED[name]
+    rows = table["rows"]
+    origins = {
+        "machine": [row["machine"] for row in rows],
+        "commit": [f"{row['commit']}, {row['date']}" for row in rows],
+    }
+    shared = [values[0] for values in origins.values() if len(set(values)) == 1]
+    varying = {title: values for title, values in origins.items() if len(set(values)) > 1}
+    lines = [[*row["cells"], *(values[i] for values in varying.values())] for i, row in enumerate(rows)]
+    text = markdown((*table["columns"], *varying), lines)
+    return text + (f"\nMeasured: {', '.join(shared)}.\n" if shared else "")
+
+
+def recipe_table(task: str) -> str:
+    """Return a table of the trainings of a task of the paper: of each metric the mean and range over the seeds."""
+    paper = RESULTS / "paper" / task
+    seeds = {
+        title: [json.loads(path.read_text())["metrics"] for path in sorted(paper.glob(f"{arm}_*/{METRICS}"))]
+        for arm, title in ARMS.items()
+    }
+    arms = {title: runs for title, runs in seeds.items() if runs}
+    lines = [
+        [test, paper, *(spread([run.get(key, {}).get("value") for run in runs]) for runs in arms.values())]
+        for test, paper, key in PAGES["recipe"][task]
+    ]
+    return markdown(("test", "paper", *arms), lines)
+
+
+def spread(values: Sequence[float | None]) -> str:
+    """Format mean and range of the values of several seeds, and the number of those that have one."""
+    known = np.array([value for value in values if value is not None])
+    number = "{:.1f}" if known.max() > 1e5 else "{:.3g}"
+    known = known / 1e6 if known.max() > 1e5 else known  # millions of policy steps
+    mean, low, high = (number.format(value) for value in (known.mean(), known.min(), known.max()))
+    count = "" if len(known) == len(values) else f", {len(known)} of {len(values)}"
+    return f"{mean} ({low}–{high}){count}"
+
+
 def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
     """Return a Markdown table with a policy for each need: tested and trained commands, success, error, limits."""
     lines = []
@@ -225,8 +276,10 @@ def _success(row: Row, kind: str) -> str:
 
 def pages() -> list[Path]:
     """Return the paths of the documentation pages and policies' READMEs that may have generated tables."""
-    return [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "reference/metrics.md",
-            *sorted(POLICIES.glob("*/README.md"))]  # fmt: skip
+    docs = RESULTS.parent
+    own = [path for folder in ("results", "reference", "explanation", "howto", "tutorials")
+           for path in sorted(docs.glob(f"{folder}/*.md"))]  # fmt: skip
+    return [*own, *sorted(POLICIES.glob("*/README.md"))]
 
 
 def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
@@ -238,13 +291,17 @@ def make_table(name: str, tasks: Mapping[str, TaskCfg]) -> str:
         return test_table(subject)
     if kind == "keys" and subject in KEYS:
         return key_table(subject)
+    if kind == "measured" and subject in MEASURED:
+        return measured_table(subject)
+    if kind == "recipe" and subject in PAGES["recipe"]:
+        return recipe_table(subject)
     if name == "choice":
         return choice_table(tasks)
     raise InputError(f"no table {name!r:.40}")
 
 
 def filled(text: str, tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the text of a page with its tables made from the policies' metrics.json; tasks: of all policies."""
+    """Return the text of a page with its tables made from their files; tasks: of all policies."""
     return BLOCK.sub(lambda block: f"{block[1]}\n{make_table(block['name'], tasks)}\n{block[3]}", text)
 
 

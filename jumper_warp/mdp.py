@@ -28,7 +28,7 @@ from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.random import RngStream, clamped_normal, fold_in, uniform, uniform_range
 from jumper_warp.kernels.mdp.reset import write_default_pose
-from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, tilt, vec12, yaw_of
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView, in_flight, tilt, vec12, yaw_of
 from jumper_warp.kernels.terrain.ground import Ground, surface, world_ground
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter, walking_filter, walking_motors
@@ -50,10 +50,9 @@ __all__ = [
     "EpisodeMetric", "EventTerm", "Ground", "Handover", "JumpState", "NoSettings", "ObservationTerm",
     "ObservationsCfg", "RandomizationCfg", "Reset", "RewardTerm", "RngStream", "RobotArrays", "RobotParameters",
     "RobotView", "Scene", "SkillSettings", "StateMetric", "TaskCfg", "TerminationTerm", "VelocityState",
-    "clamped_normal", "commanded", "events", "fold_in", "jumping_motors", "mirror", "observations", "rewards",
-    "surface", "terminations", "tilt", "uniform", "uniform_range", "vec12", "vertical_jump_filter", "waiting",
-    "walking_filter", "walking_motors", "world_ground",
-    "write_default_pose", "yaw_of",
+    "clamped_normal", "commanded", "events", "fold_in", "in_flight", "jumping_motors", "mirror", "observations",
+    "rewards", "surface", "terminations", "tilt", "uniform", "uniform_range", "vec12", "vertical_jump_filter",
+    "waiting", "walking_filter", "walking_motors", "world_ground", "write_default_pose", "yaw_of",
 ]  # fmt: skip
 
 for struct in (AttitudeState, Ground, JumpState, RobotArrays, RobotParameters, RobotView, Scene, VelocityState):

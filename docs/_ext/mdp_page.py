@@ -53,7 +53,7 @@ PAGES = {
     )),
     "states": Page("Robot and states", "Terms read the robot as a `RobotView`, and the task's state as a struct of "
                    "the task. `Advance` updates the state after each policy step.", (
-        Section("Robot", ("RobotView", "RobotArrays", "LegGeometry", "tilt", "yaw_of")),
+        Section("Robot", ("RobotView", "RobotArrays", "LegGeometry", "in_flight", "tilt", "yaw_of")),
         Section("Task states", ("Advance", "JumpState", "STANCE", "FLIGHT", "LANDED", "VelocityState",
                                 "AttitudeState", "commanded", "waiting")),
         Section("Scene and ground", ("Scene", "Ground", "Block", "surface", "world_ground")),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -52,7 +53,25 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         return
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
+    check_suite_flags(run.task, args)
     evaluate(run, parse("evaluate", run.task, args, EvaluateCfg))
+
+
+def check_suite_flags(task: TaskCfg, args: Sequence[str]) -> None:
+    """Raise UsageError if args, without --suite, have a flag that only test suites of the task's policies have."""
+    from jumper_warp.evaluation.commands import EvaluateCfg
+    from jumper_warp.evaluation.conditions import Conditions
+    from jumper_warp.evaluation.evaluations import default_flags
+    from jumper_warp.evaluation.suites import suites_for
+    from jumper_warp.utils.summary import PrintFlags
+
+    kinds = (EvaluateCfg, type(default_flags(task.evaluation, "evaluate")), Conditions, PrintFlags)
+    known = {field.name for kind in kinds for field in fields(kind)}
+    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+        name = flag[2:].replace("-", "_")
+        of = [suite for suite, kind in suites_for(task).items() if name in {field.name for field in fields(kind)}]
+        if of and name not in known:
+            raise UsageError(f"{flag} needs a test suite: add {SUITE} {' or '.join(of)}")
 
 
 def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType]) -> None:

@@ -59,7 +59,7 @@ EXIT_CODES = "Exit codes: 0 done, 1 fault, 2 invalid input, 3 inconsistent fit, 
 
 
 class UsageError(InputError):
-    """Error: a command line is invalid. The message is one line."""
+    """Raised for an invalid command line. The message is one line."""
 
 
 def usage() -> str:

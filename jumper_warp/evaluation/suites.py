@@ -118,7 +118,8 @@ class Ring(Suite):
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
-        plot(run, "landings", f"Jumps over {self.radius:g} m", {"": landings}, f"{self.num_jumps} jumps")
+        words = f"{self.num_jumps} jumps"
+        plot(run, "landings", f"Jumps over {self.radius:g} m", {"": landings}, words, magnify=10.0)
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         rows = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate")
         values = jump_metrics(landings.outcome)
@@ -336,16 +337,22 @@ class Farthest(Suite):
         }
         errors = np.array([np.where(o.success, o.distance_at_rest_m, np.nan)[:, 0] for o in outcomes])
         conditions = f"{run.title}, {self.num_jumps} jumps each"
+        values = distance_metrics(bins)
+        covered: dict[str, Any] = {
+            "from paws to paws": values["bin_paw_to_paw_distance_mean_m"].value,
+            "flown by the base": values["bin_distance_flown_mean_m"].value,
+        }
         plot_distances(
             run.folder / "max_jump.png",
             [*bins],
             successes,
             errors,
+            covered=covered,
             reliable=RELIABLE,
             published=PUBLISHED,
             conditions=conditions,
         )
-        return distance_metrics(bins)
+        return values
 
 
 def plot(run: EvaluationRun, file: str, title: str, logs: dict[str, JumpLog], words: str, **options: Any) -> None:

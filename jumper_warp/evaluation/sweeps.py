@@ -152,7 +152,7 @@ class HeightSweep(Sweep):
             paper=PAPER_HEIGHTS,
             marks=("reached", "missed"),
             title="Jumps to heights",
-            labels=("commanded base height [m]", "highest base height [m]"),
+            labels=("commanded base height [m]", "error of the highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )
         inside = within(jumps.goals[..., 2], self.flags.success_range)
@@ -194,7 +194,7 @@ class DistanceSweep(Sweep):
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run the jumps, plot reached over commanded distance, and return the metrics."""
+        """Run the jumps, plot the errors, and return the metrics."""
         landings = self.run_sweep(run, run.env(self.num_jumps), "jumps")
         trained = trained_range(run.task)["trained_range_m"]
         plot_sweep(
@@ -206,7 +206,7 @@ class DistanceSweep(Sweep):
             paper=PAPER_DISTANCES,
             marks=("on goal", "failed"),
             trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
-            labels=("commanded distance [m]", "distance of the base at the end [m]"),
+            labels=("commanded distance [m]", "error of the base at the end [m]"),
             title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )

@@ -364,6 +364,9 @@ def _labels(scene: Composition) -> list[Label]:
         height = [f"{base[2]:.2f} m"] if jumps else []
         above = height if scene.stays else [time, *height]
         place = base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]
+        if jumps:  # above the ghosts near it
+            near = np.abs((scene.bases - base) @ scene.right) < GAP
+            place[2] += scene.bases[near, 2].max() - base[2]
         if any(place[2] - 0.03 < bar < place[2] + TEXT * len(above) for bar in scene.heights):
             place[2] = scene.heights.max() + 0.03
         labels.append(Label("\n".join(above), place))

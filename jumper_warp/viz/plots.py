@@ -78,58 +78,49 @@ def plot_sweep(
     title: str,
     conditions: str,
 ) -> None:
-    """Plot reached over commanded values of a sweep, and below them the errors with their running mean.
+    """Plot the errors of a sweep over commanded values, with their running mean.
 
-    Errors beyond the range of the lower axes are marked at its edge.
+    Errors beyond the range of the axis are marked at its edge.
 
     commanded, reached [m], good (bool, success): (jumps,) each; tolerance [m]: largest error of a success; limit [m]:
     apexes of open-loop jumps of the same robots, (jumps,); trained [m]: ranges of commands by label; labels: of the
-    axes above; marks: labels of good and of other jumps.
+    axes; marks: labels of good and of other jumps.
     """
     error = reached - commanded
     pad = max(0.05 * np.ptp(commanded), 0.02)
     low = commanded.min() - pad
     high = commanded.max() + pad
-    bottom, top = np.clip(
-        [np.nanmin([*(reached - pad), low]), np.nanmax([*(reached + pad), high])], 2 * low - high, 2 * high - low
-    )
     edge = np.clip(1.1 * np.nanmax(np.abs(error), initial=tolerance), 1.5 * tolerance, 2.5 * tolerance)
-    ratios = ((top - bottom) / (high - low), 0.45)
-    size = (7.0, 5.8 * sum(ratios) + 2.4)
-    with figure(
-        path, 2, 1, sharex=True, height_ratios=ratios, figsize=size, title=title, conditions=conditions
-    ) as axes:
+    with figure(path, figsize=(7.0, 5.5), title=title, conditions=conditions) as axis:
         line = np.array([low, high])
-        none = np.zeros(2)
-        for axis, y, ideal in zip(axes, (reached, np.clip(error, -edge, edge)), (line, none), strict=True):
-            axis.fill_between(line, ideal - tolerance, ideal + tolerance, **BAND, label=f"within {tolerance:g} m")
-            axis.plot(line, ideal, color="C2", linewidth=1.0, label="commanded")
-            axis.plot(commanded[good], y[good], "o", color=ACTUAL_COLOR, alpha=0.6, label=marks[0])
-            axis.scatter(commanded[~good], y[~good], **FAILED, label=None if good.all() else marks[1])
-            plot_robot(axis, paper.robot, ideal=axis is axes[0])
+        shown = np.clip(error, -edge, edge)
+        axis.fill_between(line, -tolerance, tolerance, **BAND, label=f"within {tolerance:g} m")
+        axis.axhline(0.0, color="C2", linewidth=1.0)
+        axis.plot(commanded[good], shown[good], "o", color=ACTUAL_COLOR, alpha=0.6, label=marks[0])
+        axis.scatter(commanded[~good], shown[~good], **FAILED, label=None if good.all() else marks[1])
+        plot_robot(axis, paper.robot)
         if limit is not None:
-            axes[0].plot(commanded, limit, ".", color="0.6", label="open-loop jump of the same robot", zorder=1)
+            order = np.argsort(commanded)
+            above = (limit - commanded)[order]
+            axis.plot(commanded[order], above, ".", color="0.6", label="open-loop jump of the same robot", zorder=1)
         if paper.open_loop is not None:
-            axes[0].axhline(paper.open_loop, color="0.4", linestyle=":", label="paper, robot: open-loop jump")
+            label = "paper, robot: open-loop jump"
+            axis.plot(line, paper.open_loop - line, color="0.4", linestyle=":", label=label)
         for sign in (-1.0, 1.0):
             label = f"paper, simulation: mean error {paper.mean_error:g} m"
-            axes[1].axhline(sign * paper.mean_error, color="C1", linestyle="--", linewidth=1.0, label=label)
-        plot_running_mean(axes[1], commanded, error)
+            axis.axhline(sign * paper.mean_error, color="C1", linestyle="--", linewidth=1.0, label=label)
+        plot_running_mean(axis, commanded, error)
         for i, (label, span) in enumerate((trained or {}).items()):
             style = {"color": f"C{3 + i}", "linewidth": 5.0, "solid_capstyle": "butt"}
-            axes[1].plot(span, np.full(2, (0.1 * i - 0.95) * edge), label=label, **style)
-        axes[0].set(xlim=(low, high), ylim=(bottom, top), ylabel=labels[1], aspect="equal")
-        axes[1].set(ylim=(-edge, edge), xlabel=labels[0], ylabel="error [m]")
+            axis.plot(span, np.full(2, (0.1 * i - 0.95) * edge), label=label, **style)
+        axis.set(xlim=(low, high), ylim=(-edge, edge), xlabel=labels[0], ylabel=labels[1])
 
 
-def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]], *, ideal: bool) -> None:
-    """Plot the jumps that the paper's real robot made in a sweep (`Published.robot`).
-
-    ideal: reached values instead of errors.
-    """
+def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]]) -> None:
+    """Plot the errors of the jumps that the paper's real robot made in a sweep (`Published.robot`)."""
     command, error, size = np.array(jumps).T
     style = {"color": "C1", "markersize": 8.0, "markeredgecolor": "black", "capsize": 3.0, "zorder": 3}
-    axis.errorbar(command, error + ideal * command, yerr=size, fmt="*", label="paper, robot", **style)
+    axis.errorbar(command, error, yerr=size, fmt="*", label="paper, robot", **style)
 
 
 def plot_running_mean(axis: Any, commanded: np.ndarray, error: np.ndarray) -> None:
@@ -159,12 +150,13 @@ def plot_landings(
     title: str,
     conditions: str,
     outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
+    magnify: float = 1.0,
 ) -> None:
     """Plot goals and landing positions from above, relative to the start, one panel per test.
 
     tests: by title of the panel, goals [m] and landing positions [m], (jumps, 2), and success (jumps,); tolerance [m]:
     largest error of a success; outlines: of platforms, blocks or level ground, by key of `tests`: title that describes
-    them, and corners [m] of polygons, (polygons, corners, 2).
+    them, and corners [m] of polygons, (polygons, corners, 2); magnify: factor by which errors are drawn larger.
     """
     from matplotlib.collections import PolyCollection
 
@@ -181,13 +173,16 @@ def plot_landings(
             panel, corners = (outlines or {}).get(name, (name, np.zeros((0, 3, 2))))
             style = {"facecolor": "0.93", "edgecolor": "0.4", "linewidth": 1.0, "zorder": 0.5}
             axis.add_collection(PolyCollection(list(corners), **style), autolim=False)
-            disks = regular_polygons(np.unique(goals, axis=0), tolerance)
-            style = {"facecolor": "#d9efe8", "label": f"within {tolerance:g} m of a goal", "zorder": 0.6}
-            axis.add_collection(PolyCollection(list(disks), **style), autolim=False)
-            axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.6", linewidth=0.8)
+            ends = goals + magnify * (landing - goals)
+            if magnify == 1.0:
+                disks = regular_polygons(np.unique(goals, axis=0), tolerance)
+                style = {"facecolor": "#d9efe8", "label": f"within {tolerance:g} m of a goal", "zorder": 0.6}
+                axis.add_collection(PolyCollection(list(disks), **style), autolim=False)
+            axis.plot(*np.stack([goals, ends]).transpose(2, 0, 1), color="0.6", linewidth=0.8)
             axis.plot(*goals.T, "+", color=GOAL_COLOR, markersize=7.0, label="goal")
-            axis.plot(*landing[good].T, "o", color=ACTUAL_COLOR, alpha=0.6, label="landed there")
-            axis.scatter(*landing[~good].T, **FAILED, label=None if good.all() else "failed")
+            reached = "landed there" if magnify == 1.0 else f"landed, error drawn {magnify:g} times as large"
+            axis.plot(*ends[good].T, "o", color=ACTUAL_COLOR, alpha=0.6, label=reached)
+            axis.scatter(*ends[~good].T, **FAILED, label=None if good.all() else "failed")
             axis.plot(0.0, 0.0, "s", color="0.4", label="start")
             axis.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - margin, y1 + margin), xlabel="ahead [m]")
             axis.set(title=panel, aspect="equal")
@@ -206,17 +201,19 @@ def plot_distances(
     successes: Mapping[str, np.ndarray],
     errors: np.ndarray,
     *,
+    covered: Mapping[str, Sequence[float]],
     reliable: float,
     published: Mapping[str, float],
     conditions: str,
 ) -> None:
-    """Plot success rates and mean errors of bins of distances, with their 95 % intervals.
+    """Plot success rates, covered distances and errors of bins of distances; success with its 95 % interval.
 
     distances [m]: middles of the bins; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;
-    reliable [1]: rate of a reliable distance; published [m]: distances of other works, by name.
+    covered [m]: mean distances of each bin by label; reliable [1]: rate of a reliable distance; published [m]:
+    distances of other works, by name.
     """
-    settings = {"figsize": (8.0, 7.5), "sharex": True, "title": "Jumps to far goals", "conditions": conditions}
-    with figure(path, 2, 1, height_ratios=(3, 2), **settings) as (top, bottom):
+    settings = {"figsize": (8.0, 9.5), "sharex": True, "title": "Jumps to far goals", "conditions": conditions}
+    with figure(path, 3, 1, height_ratios=(2, 3, 2), **settings) as (top, middle, bottom):
         for marker, (label, good) in zip("o^s", successes.items(), strict=False):
             rates = [rate(row) for row in good]
             low, high = np.array([value.interval for value in rates], dtype=float).T
@@ -225,10 +222,14 @@ def plot_distances(
             )
             top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
         top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
+        top.set(ylabel="success [%]", ylim=(0.0, 103.0))
+        middle.plot(distances, distances, color="0.5", linewidth=1.0, label="goal")
+        for (label, values), color in zip(covered.items(), ("black", "C5"), strict=False):
+            middle.plot(distances, values, marker=".", color=color, label=label)
         for work, distance in published.items():
             if distance >= distances[0]:
-                top.axvline(distance, color="C4", linestyle="-.", label=f"{work}, {distance:g} m")
-        top.set(ylabel="success [%], 95 % interval", ylim=(0.0, 103.0))
+                middle.axhline(distance, color="C4", linestyle="-.", label=f"{work}, {distance:g} m")
+        middle.set(ylabel="distance [m]")
         for distance, error in zip(distances, errors, strict=True):
             bottom.plot(np.full(len(error), distance), error, ".", color="0.7", zorder=1, label="jump")
         means = [np.nan if np.isnan(error).all() else np.nanmean(error) for error in errors]

@@ -1,4 +1,4 @@
-"""Motor command filter (Olsen et al., Section III): clamps targets to limits, more firmly the sooner these are reached.
+"""Motor command filter (Olsen et al., Section III): limits targets more strictly as a joint nears its limit.
 
 It keeps motors off their stops and links off one another, whatever the policy commands, and leaves a target free while
 its joint is far from the limits. Angles are positive outward (lateral), and away from the leg's other thigh (outer,

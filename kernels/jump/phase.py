@@ -6,7 +6,7 @@ World z is up. The base is taken for a projectile under gravity g, so that a tak
 
 import warp as wp
 
-from ..mdp.view import RobotView, tilt
+from ..mdp.view import RobotView, in_flight, tilt
 from .state import FLIGHT, LANDED, STANCE, JumpState
 
 
@@ -46,16 +46,11 @@ def landing_error_estimate(robot: RobotView, state: JumpState, height: float) ->
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step.
-
-    A jump takes off when no paw is in contact and the base rises faster than takeoff_speed [m/s]. It touches down when
-    a paw is in contact and the base does not rise faster than that. Contact at a higher upward speed belongs to the
-    push-off (compliant contact can break during it) or to a clipped edge: the robot stays in flight.
-    """
-    rises = robot.lin_vel[2] > takeoff_speed
-    if state.phase == STANCE and robot.contacts == 0 and rises:
+    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step; takeoff_speed: of `in_flight`."""
+    flies = in_flight(robot, state.phase == FLIGHT, takeoff_speed)
+    if state.phase == STANCE and flies:
         return FLIGHT
-    if state.phase == FLIGHT and robot.contacts > 0 and not rises:
+    if state.phase == FLIGHT and not flies:
         return LANDED
     return state.phase
 

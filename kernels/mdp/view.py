@@ -266,6 +266,23 @@ def angle_from_level(quat: wp.quat, heading: float) -> float:
 
 
 @wp.func
+def in_flight(robot: RobotView, flying: bool, takeoff_speed: float) -> bool:
+    """Return whether the robot is in flight after this policy step; flying: the result of the previous step.
+
+    A flight begins when no paw is in contact and the base rises faster than takeoff_speed [m/s], 0.75 in the stock
+    jumps: a squat that lifts all paws is no flight. It ends when a paw is in contact and the base does not rise faster
+    than that. Contact at a higher upward speed belongs to the push-off (compliant contact can break during it) or to a
+    clipped edge.
+    """
+    rises = robot.lin_vel[2] > takeoff_speed
+    if robot.contacts == 0 and rises:
+        return True
+    if robot.contacts > 0 and not rises:
+        return False
+    return flying
+
+
+@wp.func
 def tilt(robot: RobotView) -> float:
     """Return the angle [rad], 0 to pi, by which the base is tilted: between body z and world z."""
     return wp.acos(wp.clamp(-robot.projected_gravity[2], -1.0, 1.0))

@@ -78,6 +78,13 @@ def test_refuses_suites_of_other_tasks(policies, task, suite, available):
         evaluate.run([str(policies / task), "--suite", *suite], [])
 
 
+@pytest.mark.parametrize(("flag", "suites"), [("--num-recorded", "range or grid"), ("--edge=0.3", "platform")])
+def test_flags_of_suites_name_the_suites_that_they_need(policies, flag, suites):
+    name = flag.partition("=")[0]
+    with pytest.raises(InputError, match=f"^{name} needs a test suite: add --suite {suites}"):
+        evaluate.run([str(policies / "horizontal-jump"), flag, "1"], [])
+
+
 def test_success_range_selects_goals_by_distance():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]  # [m] at distances 0.3, 0.3 and 0.85
     flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))

@@ -1,7 +1,9 @@
 """Conditions and tables of the shipped policies, and the experiment at a tiny size."""
 
 import json
+import re
 import shutil
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 
 from experiments import measure_policies
 from experiments.measure_policies import payload_overlay, run_test, with_trials
-from experiments.policy_tables import filled, main_table, pages
+from experiments.policy_tables import MEASURED, filled, main_table, pages
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
@@ -67,6 +69,24 @@ def tasks():
 def test_tables_of_the_pages_are_those_of_metrics_json(page, tasks):
     text = page.read_text(encoding="utf-8")
     assert filled(text, tasks) == text, "run python experiments/policy_tables.py"
+
+
+def test_measured_rows_have_machine_commit_and_date_and_their_tables_are_on_pages():
+    text = "".join(page.read_text(encoding="utf-8") for page in pages())
+    for name, table in MEASURED.items():
+        assert f"<!-- table: measured {name} -->" in text
+        for row in table["rows"]:
+            assert row["machine"] and len(row["cells"]) == len(table["columns"]), row
+            assert re.fullmatch(r"[0-9a-f]{8}", row["commit"]) and date.fromisoformat(row["date"]), row
+
+
+def test_performance_and_seeds_have_no_table_without_a_file():
+    for page in pages():
+        text = re.sub(r"<!-- table:.*?<!-- end of table -->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        sections = re.split(r"^## ", text, flags=re.MULTILINE)
+        typed = [part.splitlines()[0] for part in sections if re.search(r"^\|", part, re.MULTILINE)]
+        assert "Seeds" not in typed
+        assert page.stem != "performance" or typed == ["Other projects"]  # published by others
 
 
 def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):

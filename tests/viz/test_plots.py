@@ -35,21 +35,18 @@ def line(axis, label):
     return next(line for line in axis.lines if line.get_label() == label)
 
 
-def test_sweep_has_equal_axes_and_errors_below(drawn):
+def test_sweep_shows_errors_and_the_open_loop_jump_as_an_error(drawn):
     error = np.linspace(-0.15, 0.05, 30)
-    top, bottom = sweep(drawn, error, error > -0.1)
-    assert top.get_aspect() == 1.0 and bottom.get_ylabel() == "error [m]"
-    np.testing.assert_allclose(line(bottom, "reached").get_ydata(), error[error > -0.1], atol=1e-12)
-    reached = np.linspace(0.5, 1.2, 30) + error  # [m]
-    np.testing.assert_allclose(line(top, "reached").get_ydata(), reached[error > -0.1])
+    (axis,) = sweep(drawn, error, error > -0.1)
+    np.testing.assert_allclose(line(axis, "reached").get_ydata(), error[error > -0.1], atol=1e-12)
+    limit = line(axis, "paper, robot: open-loop jump")
+    np.testing.assert_allclose(np.sum(limit.get_xydata(), axis=1), 1.075)  # command + error [m]
 
 
 def test_sweep_marks_the_values_of_the_paper(drawn):
-    top, bottom = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
-    robot = {axis: axis.containers[0][0].get_xydata() for axis in (top, bottom)}
-    np.testing.assert_allclose(robot[top], [(0.75, 0.75), (1.0, 1.01)])
-    np.testing.assert_allclose(robot[bottom], [(0.75, 0.0), (1.0, 0.01)])
-    means = [line.get_ydata()[0] for line in bottom.lines if "paper, simulation" in line.get_label()]
+    (axis,) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
+    np.testing.assert_allclose(axis.containers[0][0].get_xydata(), [(0.75, 0.0), (1.0, 0.01)])
+    means = [line.get_ydata()[0] for line in axis.lines if "paper, simulation" in line.get_label()]
     assert means == [-0.04, 0.04]
 
 
