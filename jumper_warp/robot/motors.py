@@ -152,7 +152,7 @@ def motor_arrays(
     motors.fade_start = cfg.fade_start
     motors.fade_end = cfg.fade_end
     if robot is not None:
-        for name in ("kp", "kd", "saturation"):
+        for name in ("kp", "kd", "saturation", "peak"):
             array = getattr(motors, name)
             array.assign((array.numpy() * getattr(robot, name).T).astype(np.float32))
         for name in ("no_load_speed", "cutoff_speed", "offset"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import newton
 import warp as wp
@@ -13,6 +14,7 @@ from jumper_warp.kernels.actuation.passive import passive_torque_kernel
 from jumper_warp.kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
 from jumper_warp.kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.model import KNEE_DOFS, LOOP_IMPEDANCE, PAWS, PHYSICS_DT, other_colliders
 from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange
 from jumper_warp.utils.errors import InputError
@@ -97,12 +99,13 @@ class MujocoDynamics(JumperDynamics):
         dt: float = PHYSICS_DT,
         tolerance: float = TOLERANCE,
         observe_forces: bool = True,
+        description: RobotDescription | Sequence[RobotDescription] | None = None,
     ) -> None:
         """Create Newton's MuJoCo solver; state: the one that it advances; control: gets the torques; dt: step [s].
 
         tolerance: checked only. observe_forces: see `Simulation`. Raises as `JumperDynamics` and `mujoco_solver`.
         """
-        super().__init__(model, tolerance=tolerance)
+        super().__init__(model, tolerance=tolerance, description=description)
         self._state = state
         self._control = control
         knee_damping = take_knee_damping(model)
