@@ -250,7 +250,7 @@ def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
 def _motor(name: str, rows: Any) -> Motor:
     """Return the motor of a type from its rows in a table."""
     value = _values(f"motors {name}", rows, MOTOR)
-    gains = {of: Gains(value.pop(f"kp_{of}"), value.pop(f"kd_{of}")) for of in ("jumping", "walking")}
+    gains: Any = {of: Gains(value.pop(f"kp_{of}"), value.pop(f"kd_{of}")) for of in ("jumping", "walking")}
     speeds = {key: value.pop(key) * RAD_PER_S_PER_RPM for key in ("cutoff_speed", "no_load_speed")}
     return Motor(name, **value, **speeds, **gains)
 

@@ -26,7 +26,7 @@ from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json, write_atomically
+from jumper_warp.utils.files import Json, read_json, write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
 ROBOTS = ASSETS / "robots"  # Folder of the project's robots beside the Jumper, found by their names
@@ -87,7 +87,7 @@ class RobotOverlay:
     """By field of `RandomizationCfg`, (lower, upper) in the field's unit and meaning: factor, offset or value."""
     source: str = ""
     """Origin of the values, free text."""
-    robot: Mapping[str, Any] | None = None
+    robot: Json | None = None
     """Table of the robot that the values differ from, as in the `robot.json` of its folder; None: the Jumper."""
 
     def __post_init__(self) -> None:

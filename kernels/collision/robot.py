@@ -123,6 +123,8 @@ def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
     span = SHANK_APART * (outer_knee - inner_knee)
     geo = capsules.geometry
     thighs = inflated_distance(thighs_sq, real(2.0) * geo.thigh_radius, bound)
+    if geo.outer_x == geo.inner_x:
+        thighs = bound  # thighs about one axis lie in two planes
     crossed = inflated_distance(wp.min(outer_thigh_sq, inner_thigh_sq), geo.thigh_radius + geo.shank_radius, bound)
     shanks = inflated_distance(wp.dot(span, span), real(2.0) * geo.shank_radius, bound)
     return wp.min(thighs, wp.min(crossed, shanks))
