@@ -13,7 +13,7 @@ from jumper_warp.robot.legs import leg_dimensions
 from jumper_warp.robot.motors import FilterCfg, LimitsCfg, MotorCfg, MotorKindCfg
 from jumper_warp.robot.values import ratio
 
-JUMPER_APEX = 1.07545  # [m] `open_loop_apex` of the Jumper
+JUMPER_APEX = 1.07545  # [m] `OpenLoopJump` of the Jumper
 
 
 @dataclass(frozen=True)

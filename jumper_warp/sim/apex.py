@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,24 +21,31 @@ LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
 """[1] Action of the transversal motors at every policy step of the open-loop jump: 1 squat, -1 extension."""
 
 
-def open_loop_apex(robot: RobotOverlay, solver: SolverName = "jumper", seconds: float = 0.0) -> float:
-    """Simulate the open-loop jump with the motors and the filter of the vertical jump; return the largest height [m].
+class OpenLoopJump:
+    """Simulation of a robot's open-loop jump with the motors and the filter of the vertical jump."""
 
-    seconds: time to coast beyond `COAST`. The base never rises if the robot falls.
-    """
-    description = robot.description
-    sim = Simulation(
-        1, solver=solver, robot=robot, device="cpu", visuals=False,
-        motors=motors_for(jumping_motors(18.0, lateral_torque=10.0), description),
-        command_filter=filter_for(vertical_jump_filter(), description),
-    )  # fmt: skip
-    pose, apex = description.pose("default"), 0.0
-    for step, level in enumerate([*LEVELS, *np.zeros(round(60.0 * seconds))]):
-        sim.set_targets(pose + np.tile([0.0, level, level], 4) * np.pi / 2.0)
-        sim.step()
-        if step >= STAND + RAMP + HOLD:
-            apex = max(apex, float(sim.joint_q()[0, 2]))
-    return apex
+    def __init__(self, robot: RobotOverlay, solver: SolverName = "jumper", *, visuals: bool = False) -> None:
+        """Prepare the simulation; visuals: whether it has the shapes that viewers see."""
+        self.pose = robot.description.pose("default")
+        self.sim = Simulation(
+            1, solver=solver, robot=robot, device="cpu", visuals=visuals,
+            motors=motors_for(jumping_motors(18.0, lateral_torque=10.0), robot.description),
+            command_filter=filter_for(vertical_jump_filter(), robot.description),
+        )  # fmt: skip
+
+    def run(self, after_step: Callable[[], None] = lambda: None) -> float:
+        """Simulate the jump once, and return the largest height of the base [m] from the extension on.
+
+        after_step: called after every policy step.
+        """
+        apex = 0.0
+        for step, level in enumerate(LEVELS):
+            self.sim.set_targets(self.pose + np.tile([0.0, level, level], 4) * np.pi / 2.0)
+            self.sim.step()
+            after_step()
+            if step >= STAND + RAMP + HOLD:
+                apex = max(apex, float(self.sim.joint_q()[0, 2]))
+        return apex
 
 
 @functools.cache
@@ -51,4 +59,4 @@ def measure(robot: RobotOverlay) -> Measures:
     """Return the measures of a robot; its open-loop jump is simulated."""
     if robot.is_jumper:
         return jumper_measures()
-    return measures_of(described(robot.robots(), robot.description), open_loop_apex(robot))
+    return measures_of(described(robot.robots(), robot.description), OpenLoopJump(robot).run())
