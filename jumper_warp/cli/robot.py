@@ -64,7 +64,7 @@ def run(args: Sequence[str], modules: Sequence[Any] = ()) -> None:
         if args and args[0] in ("-h", "--help"):
             print(usage)
             return
-        raise UsageError(usage)
+        raise UsageError("expected jumper robot new, check or show; see jumper robot --help")
     kind, action = actions[args[0]]
     action(parse(kind, f"robot {args[0]}", args[1:]))
 

@@ -15,6 +15,7 @@ from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
@@ -157,16 +158,18 @@ def record_motions(
     solver: SolverName = "jumper",
     rng: np.random.Generator | None = None,
     torque: bool = False,
+    description: RobotDescription | None = None,
 ) -> list[RecordedMotion]:
     """Record chosen motions on a simulated robot, and write each to `folder` as `<number>_<kind>.npz`. Returns them.
 
-    robots: the robot, N = 1. solver: physics solver. noise, rng, torque: see `measure`. Raises OSError.
+    robots: values of the robot, N = 1; description: by default the Jumper's. solver: physics solver.
+    noise, rng, torque: see `measure`. Raises OSError.
     """
     motions = []
     with phase("recording motions", len(chosen.plans)) as advance:
         for i, plan in enumerate(chosen.plans):
             name = f"{i}_{plan.kind.replace(' ', '_')}"
-            record = simulate_plan(plan, solver=solver, robots=robots)
+            record = simulate_plan(plan, solver=solver, robots=robots, description=description)
             motions.append(measure(plan, name, record, robots, rng, noise, torque=torque))
             motions[-1].save(folder / f"{name}.npz")
             advance()

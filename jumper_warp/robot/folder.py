@@ -330,7 +330,7 @@ def _body_shapes(size: np.ndarray) -> tuple[Shape, ...]:
     """Return the box that shows a body's shell; size [m]: length, width of the widest motors, height."""
     straight = quat_from_rpy(0.0, 0.0, 0.0)
     trunk = np.array([1.0, 0.5, 1.0]) * size
-    return (Shape("box", tuple(trunk.tolist()), np.array([0.0, 0.0, 0.17 * size[2]]), straight, (0.86, 0.87, 0.88)),)
+    return (Shape("box", tuple(trunk.tolist()), np.array([0.0, 0.0, 0.17 * size[2]]), straight, (0.3, 0.42, 0.55)),)
 
 
 def read_urdf(path: Path) -> RobotDescription:

@@ -120,7 +120,8 @@ class Simulation(Uncopied):
         visuals: Whether to add shapes that only viewers see.
         extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
         robot: A robot (`load_overlay`), several that the worlds take in turn, or values of one robot (N = 1) or of
-            every world (N = num_worlds) that replace the Jumper's. Their latency is not applied.
+            every world (N = num_worlds) that replace those of `description`. Their latency is not applied.
+        description: Robot that `robot` has the values of; by default the overlay's, or the Jumper.
         threads: Number of CPU threads, which does not change results; by default that of
             `jumper_warp.utils.threads.set_threads`, or all cores. SolverMuJoCo and few worlds use one.
 
@@ -150,6 +151,7 @@ class Simulation(Uncopied):
         visuals: bool = True,
         extras: Extras | None = None,
         robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues | None = None,
+        description: RobotDescription | None = None,
         device: wp.DeviceLike = None,
         threads: int | None = None,
     ):
@@ -162,7 +164,7 @@ class Simulation(Uncopied):
         substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
         self.robot = values = _values_of(robot, friction, num_worlds)
-        self.descriptions = _descriptions_of(robot)
+        self.descriptions = _descriptions_of(robot) if description is None else [description]
         self.model = build_model(
             num_worlds, description=self.descriptions, ground=ground, friction=friction, gravity=gravity,
             visuals=visuals, extras=extras, device=device, mujoco=solver == "mujoco", robot=values,
