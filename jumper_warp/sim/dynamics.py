@@ -276,7 +276,8 @@ class JumperDynamics:
         self.ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
-        self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
+        springs = np.array([robots[world % len(robots)].spring for world in range(self.num_worlds)], dtype=np.float32)
+        self.leg_springs = wp.array(springs, dtype=wp.vec2, device=self.device)
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between knees, vec2 of shape (num_worlds,).
 
         Call `pack_springs` after a change."""
