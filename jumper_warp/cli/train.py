@@ -58,8 +58,8 @@ class TrainArgs:
     observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
     without randomisation and noise."""
     robot: Path | None = None
-    """Folder or name of a robot, or overlay, as `jumper sysid fit` writes it. Robots are sampled around its values. Its
-    randomisation ranges override the task's; flags override both."""
+    """Robot: its folder or name, or an overlay. Robots are sampled around its values. Its randomisation ranges override
+    the task's; flags override both."""
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""

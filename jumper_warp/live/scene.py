@@ -68,8 +68,8 @@ class RobotScene:
         return np.concatenate([knee, multiply(housing[..., 3:], turn)], axis=-1)
 
 
-def robot_scene(model: Model, robot: RobotDescription) -> RobotScene:
-    """Return the scene of a simulation's model: drawn shapes of the robot, the ground, the model's legs."""
+def robot_scene(model: Model, robot: RobotDescription | None = None) -> RobotScene:
+    """Return the scene of a simulation's model: drawn shapes of the robot (default: Jumper), the ground, the legs."""
     from jumper_warp.robot.model import build_model
     from jumper_warp.viz.shapes import shape_meshes
 

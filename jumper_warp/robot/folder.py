@@ -80,21 +80,10 @@ def read_robot(path: Path) -> Json:
 
 def write_robot(folder: Path, table: Json) -> Path:
     """Write a robot's table to a folder, one quantity a line, and return the file's path. Raises OSError."""
-    sections = []
-    for name, section in table.items():
-        text = json.dumps(section)
-        if isinstance(section, Mapping):
-            groups = section.items() if name == "motors" else [("", section)]
-            body = [
-                ((f'    "{kind}": {{\n' if kind else "")
-                 + ",\n".join(f"    {'  ' * bool(kind)}{json.dumps(k)}: {json.dumps(v)}" for k, v in group.items())
-                 + ("\n    }" if kind else ""))
-                for kind, group in groups
-            ]  # fmt: skip
-            text = "{\n" + ",\n".join(body) + "\n  }"
-        sections.append(f"  {json.dumps(name)}: {text}")
+    text = json.dumps(table, indent=2)
+    text = re.sub(r'\{\s+"value".*?\n +\}', lambda row: " ".join(row.group().split()), text, flags=re.DOTALL)
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / FILE, ("{\n" + ",\n".join(sections) + "\n}\n").encode())
+    write_atomically(folder / FILE, f"{text}\n".encode())
     return folder / FILE
 
 
