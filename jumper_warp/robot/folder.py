@@ -62,7 +62,7 @@ MOTOR = {
 """Unit of each quantity by section of a table: of the body, of a leg, of all legs, and of a type of motor."""
 SECTIONS = {"body": BODY, "legs": COMMON, "front": LEG, "back": LEG}
 SHELL = np.array([0.686, 0.398, 0.148])  # [m] Length, width and height of the Jumper's shell, for whose factor of 1
-LOCKED = Motor("locked", 1.0, 1.0e5, 1.0, 1.0, 2.0, 0.0, Gains(0.0, 0.0), Gains(0.0, 0.0))
+LOCKED = Motor("locked", 1.0, 1.0e5, 1.0, 1.0, 2.0, 1.0e-3, Gains(0.0, 0.0), Gains(0.0, 0.0))
 """Motor of a leg without lateral axis (`"lateral_motor": "locked"`): its inertia keeps the axis at its angle."""
 ELSEWHERE = "this package simulates four five-bar legs; use Newton or mjlab for serial legs and other numbers of legs"
 
