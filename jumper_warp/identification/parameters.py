@@ -192,9 +192,12 @@ def relative(
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return the parameters of motors: kp, kd, armature of each; torque limit, cutoff, no-load speed of each kind."""
     parameters = []
+    nominal = RobotValues.nominal(1, robot)
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
+        values = getattr(nominal, quantity)[0]
         parameters += [
-            relative(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+            relative(f"{quantity}/{j}", quantity, (i,), "1", float(values[i]), prior, "motors")
+            for i, j in enumerate(MOTOR_JOINTS)
         ]
     for i, joint in enumerate(MOTOR_JOINTS):
         parameters.append(
