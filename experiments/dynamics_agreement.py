@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.model import MOTOR_DOFS, build_model
-from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.utils.output import output_dir
@@ -57,7 +57,7 @@ States = dict[str, np.ndarray]  # Keys and shapes: `random_states`
 Quantities = dict[str, np.ndarray]  # Keys: those of UNITS
 
 
-def random_states(n: int, seed: int) -> States:
+def random_states(n: int, seed: int, robot: RobotDescription | None = None) -> States:
     """Return n random states of the robot in flight by name.
 
     quat (n, 4), xyzw, com_vel (n, 3) [m/s], ang_vel (n, 3) [rad/s] of the base, world axes; angles [rad], rates
@@ -65,24 +65,25 @@ def random_states(n: int, seed: int) -> States:
     """
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
+    robot = robot or load_description()
     return {
         "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True), "com_vel": rng.normal(size=(n, 3)),
-        "ang_vel": 2.0 * rng.normal(size=(n, 3)), "angles": random_motors(load_description(), n, rng, MARGIN).T,
+        "ang_vel": 2.0 * rng.normal(size=(n, 3)), "angles": random_motors(robot, n, rng, MARGIN).T,
         "rates": 4.0 * rng.normal(size=(n, 12)), "torque": rng.uniform(-18.0, 18.0, (n, 12)),
     }  # fmt: skip
 
 
-def jumper_quantities(values: RobotValues, states: States) -> Quantities:
+def jumper_quantities(values: RobotValues, states: States, robot: RobotDescription | None = None) -> Quantities:
     """Compute accelerations, paw positions and Jacobians in given states by this project's dynamics.
 
     The dynamics only advance states: accelerations are changes of velocity over one tiny step, DT. The robot is the
     first one of `values`. Keys: those of UNITS.
     """
     n = len(states["angles"])
-    model = build_model(n, ground=None, visuals=False, device="cpu", robot=values)
+    model = build_model(n, ground=None, visuals=False, device="cpu", robot=values, description=robot)
     model.joint_friction.zero_()
     model.joint_damping.zero_()
-    dynamics = JumperDynamics(model, double=True)
+    dynamics = JumperDynamics(model, double=True, description=robot)
     q, qd, force = (np.zeros((n, width)) for width in (43, 38, 38))
     q[:, 3:7], q[:, [1 + dof for dof in MOTOR_DOFS]] = states["quat"], states["angles"]
     qd[:, :3] = states["com_vel"]
@@ -128,7 +129,7 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     model = dynamics.model
     q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
     shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
-    anchors = np.array([loop.parent_anchor for loop in dynamics.description.loops])
+    anchors = np.array([dynamics.description.link(f"{leg}_inner_shank").collisions[0].position for leg in LEGS])
     arms = anchors - model.body_com.numpy()[shanks]
     paws = []
     columns = []
@@ -146,29 +147,29 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     return {"paw_position": paws[0], "paw_jacobian": np.stack(columns, axis=3)}
 
 
-def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
+def pinocchio_quantities(values: RobotValues, states: States, robot: RobotDescription | None = None) -> Quantities:
     """Compute accelerations, paw positions and Jacobians in given states by Pinocchio.
 
     Its base velocity v is that of the body's origin, in body axes; with the spin w, the origin's acceleration in these
     axes is dv/dt + w x v. The robot is the first one of `values`. Keys: those of UNITS.
     """
-    robot = build_pinocchio(values=values)
+    oracle = build_pinocchio(robot, values)
     rows = []
     for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
         turn = Rotation.from_quat(quat)
         spin = turn.inv().apply(ang_vel)
         twist = np.concatenate([turn.inv().apply(com_vel) - np.cross(spin, values.base_com[0]), spin])
-        q = robot.configuration(np.zeros(3), quat, angles)
-        v = robot.closed_velocity(q, twist, rates)
-        acceleration = robot.forward_dynamics(q, v, torque)
-        level = robot.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
+        q = oracle.configuration(np.zeros(3), quat, angles)
+        v = oracle.closed_velocity(q, twist, rates)
+        acceleration = oracle.forward_dynamics(q, v, torque)
+        level = oracle.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
         rows.append(
             (
                 acceleration[:3] + np.cross(v[3:6], v[:3]),
                 acceleration[3:6],
-                acceleration[robot.motor_v],
-                robot.paw_positions(level),
-                robot.paw_jacobians(level),
+                acceleration[oracle.motor_v],
+                oracle.paw_positions(level),
+                oracle.paw_jacobians(level),
             )
         )
     names = ("base_acceleration", "base_angular_acceleration", "joint_acceleration", "paw_position", "paw_jacobian")
@@ -179,7 +180,7 @@ def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
 class Args(OutputArgs):
     """Flags of the comparison of dynamics with Pinocchio."""
 
-    robot: Path | None = None  # Robot overlay (docs/reference/overlays.md; default: the robot as described)
+    robot: Path | None = None  # Folder of a robot, or overlay (docs/reference/overlays.md; default: the Jumper)
     states: int = 200  # Number of random states
     seed: int = 0  # Seed of the states
 
@@ -198,10 +199,11 @@ def main(args: Args) -> dict:
     """Compare accelerations, paw positions and paw Jacobians with Pinocchio, and return the metrics."""
     configure_device("cpu")
     folder = output_dir("dynamics_agreement", args.out)
-    values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
-    states = random_states(args.states, args.seed)
-    ours = jumper_quantities(values, states)
-    expected = pinocchio_quantities(values, states)
+    overlay = RobotOverlay({}) if args.robot is None else load_overlay(args.robot)
+    values, robot = overlay.robots(), overlay.description
+    states = random_states(args.states, args.seed, robot)
+    ours = jumper_quantities(values, states, robot)
+    expected = pinocchio_quantities(values, states, robot)
     metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
     for name, unit in UNITS.items():
         difference, relative = differences(ours[name], expected[name])

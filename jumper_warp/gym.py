@@ -21,7 +21,7 @@ def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVector
     Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
     adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
-    return GymVectorEnv(Env(make_task(task), num_envs, **arguments), **adapter)
+    return GymVectorEnv(Env(make_task(task, arguments.get("robot")), num_envs, **arguments), **adapter)
 
 
 def make_env(task: str, **arguments: Any) -> GymEnv:
@@ -30,7 +30,7 @@ def make_env(task: str, **arguments: Any) -> GymEnv:
     Raises InputError: an unknown task, or arguments that `Env` or `GymEnv` refuses.
     """
     adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
-    return GymEnv(Env(make_task(task), 1, **arguments), **adapter)
+    return GymEnv(Env(make_task(task, arguments.get("robot")), 1, **arguments), **adapter)
 
 
 def env_id(task: str) -> str:

@@ -47,10 +47,13 @@ class Recipe:
         object.__setattr__(self, "train", dataclasses.replace(self.train, task=self.task.name))
 
     @classmethod
-    def of(cls, name: str) -> Recipe:
-        """Return the default recipe of a task by name or alias. Raises InputError: there is no such task."""
+    def of(cls, name: str, robot: RobotOverlay | None = None) -> Recipe:
+        """Return the default recipe of a task by name or alias, of the Jumper or of another robot (`load_overlay`).
+
+        Raises InputError: there is no such task.
+        """
         name, entry = find_task(name)
-        return cls(entry.task(name), entry.training(name))
+        return cls(entry.task(name, robot), entry.training(name), robot=robot)
 
     @classmethod
     def from_json(

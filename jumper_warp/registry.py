@@ -27,6 +27,7 @@ from jumper_warp.utils.files import existing_file
 from jumper_warp.utils.sources import PROJECT_PREFIX, module_from_file, own_fault
 
 if TYPE_CHECKING:
+    from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.tasks.cfg import TaskCfg
 
 MAX_SOURCE_BYTES = 2**20  # Size of the largest file of tasks that is imported
@@ -81,8 +82,11 @@ class TaskEntry:
         module, _, function = self.make.partition(":")
         return getattr(importlib.import_module(module), function)
 
-    def task(self, name: str) -> TaskCfg:
-        """Return the task that the factory makes. Raises InputError: it is invalid, no TaskCfg, or has another name."""
+    def task(self, name: str, robot: RobotOverlay | None = None) -> TaskCfg:
+        """Return the task that the factory makes, a task of the project with its numbers for a robot.
+
+        Raises InputError: it is invalid, no TaskCfg, or has another name.
+        """
         from jumper_warp.tasks.cfg import TaskCfg
 
         make = self.factory()
@@ -97,7 +101,12 @@ class TaskEntry:
             raise InputError(f"task {name!r} of {self.origin}: expected a TaskCfg, got {type(task).__name__}")
         if task.name != name:
             raise InputError(f"task {name!r} of {self.origin} calls itself {task.name!r:.60}; give both the same name")
-        return task
+        if robot is None or robot.is_jumper or not self.of_project:
+            return task
+        from jumper_warp.sim.apex import jumper_measures, measure
+        from jumper_warp.tasks.scaling import scaled
+
+        return scaled(task, robot.description, measure(robot), jumper_measures())
 
 
 def first_sentence(doc: str) -> str:
@@ -167,13 +176,14 @@ TASKS: dict[str, TaskEntry] = {
 """Registered tasks by name: those of the project, of the user, and of installed packages once loaded."""
 
 
-def make_task(name: str) -> TaskCfg:
+def make_task(name: str, robot: RobotOverlay | None = None) -> TaskCfg:
     """Return a task by name or alias, where - counts as _.
 
-    Raises InputError: it is unknown, or its factory returns no such task.
+    robot: of other lengths than the Jumper's (`load_overlay`), in whose measures the project's tasks state their
+    numbers. Raises InputError: the task is unknown, or its factory returns no such task.
     """
     name, entry = find_task(name)
-    return entry.task(name)
+    return entry.task(name, robot)
 
 
 def trainer_settings(name: str) -> PpoCfg:

@@ -23,6 +23,7 @@ from jumper_warp.cli.list import ListCfg, RunsCfg
 from jumper_warp.cli.main import COMMANDS, EXIT_CODES
 from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.rescore import RescoreCfg
+from jumper_warp.cli.robot import CheckCfg, NewCfg, ShowCfg
 from jumper_warp.cli.sweep import SweepCfg
 from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
@@ -77,6 +78,8 @@ def cli_page() -> str:
         section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
         f"## `jumper deploy BUNDLE`\n\n```text\n{deploy_parser().format_help()}```",
         section("bus-sim", doc(BusSimCfg), list_flags(BusSimCfg)),
+        *(section(f"robot {name}", doc(kind), list_flags(kind))
+          for name, kind in (("new FOLDER", NewCfg), ("check ROBOT", CheckCfg), ("show ROBOT", ShowCfg))),
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
         section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.evaluation.recorder import ankles
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
+from jumper_warp.sim.apex import EXTEND, HOLD, RAMP
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS

@@ -42,6 +42,7 @@ class PinocchioRobot:
     motor_v: np.ndarray  # (12,) index into v of each motor
     knee_q: np.ndarray  # (8,) index into q of the knees: outer, inner of each leg
     knee_v: np.ndarray  # (8,) index into v of the knees
+    paws: np.ndarray  # (4, 3) [m] centre of each paw in the frame of its inner shank
 
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
         """Return Pinocchio's configuration q, (27,), of base and motors, with knee angles that close the loops.
@@ -74,7 +75,8 @@ class PinocchioRobot:
     def paw_positions(self, q: np.ndarray) -> np.ndarray:
         """Return the paws' centres [m], shape (4, 3), world frame, legs FL, FR, BL, BR, of a configuration (27,)."""
         pin.forwardKinematics(self.model, self.data, q)
-        return np.array([self.data.oMi[c.joint1_id].act(c.joint1_placement.translation) for c in self.constraints])
+        pairs = zip(self.constraints, self.paws, strict=True)
+        return np.array([self.data.oMi[c.joint1_id].act(paw) for c, paw in pairs])
 
     def paw_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the velocities of the paws' centres [m/s], shape (4, 3), world frame, legs FL, FR, BL, BR.
@@ -83,10 +85,10 @@ class PinocchioRobot:
         """
         pin.forwardKinematics(self.model, self.data, q, v)
         velocities = []
-        for c in self.constraints:
+        for c, paw in zip(self.constraints, self.paws, strict=True):
             twist = self.data.v[c.joint1_id]
             rotation = self.data.oMi[c.joint1_id].rotation
-            velocities.append(rotation @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
+            velocities.append(rotation @ (twist.linear + np.cross(twist.angular, paw)))
         return np.array(velocities)
 
     def paw_jacobians(self, q: np.ndarray) -> np.ndarray:
@@ -136,16 +138,21 @@ class PinocchioRobot:
         }
         separation = abs(origin["outer"][0] - origin["inner"][0])
         thigh = -origin["outer_knee"][2]
-        shank = -self.constraints[LEGS.index(leg)].joint1_placement.translation[2]
+        constraint = self.constraints[LEGS.index(leg)]
+        shank, outer_shank = (-end.translation[2] for end in (constraint.joint1_placement, constraint.joint2_placement))
         # vector [m] from inner to outer knee in the leg's plane: across, toward the outer side, and down
         across = separation + thigh * (math.sin(outer) + math.sin(inner))
         down = thigh * (math.cos(outer) - math.cos(inner))
-        cosine = 0.5 * math.hypot(across, down) / shank
-        if not cosine < 1.0:
-            raise InputError(f"expected knees of {leg} within reach of the shanks, found {2.0 * shank * cosine:.4f} m")
-        base = math.acos(cosine)
+        apart = math.hypot(across, down)
+        if not abs(shank - outer_shank) < apart < shank + outer_shank:
+            raise InputError(f"expected knees of {leg} within reach of the shanks, found {apart:.4f} m")
         slope = math.atan2(down, across)
-        return outer + 0.5 * math.pi + slope - base, inner + 0.5 * math.pi - slope - base
+        # angles of the triangle of knees and ankle, by the law of cosines
+        base, outer_base = (
+            math.acos((apart**2 + one**2 - other**2) / (2.0 * apart * one))
+            for one, other in ((shank, outer_shank), (outer_shank, shank))
+        )
+        return outer + 0.5 * math.pi + slope - outer_base, inner + 0.5 * math.pi - slope - base
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
@@ -182,4 +189,5 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
         motor_v=np.array([joint.idx_v for joint in joints]),
         knee_q=np.array([knee.idx_q for knee in knees]),
         knee_v=np.array([knee.idx_v for knee in knees]),
+        paws=np.array([robot.link(f"{leg}_inner_shank").collisions[0].position for leg in LEGS]),
     )

@@ -18,7 +18,7 @@ class ExportRobotCfg:
     """Folder to write to; existing files are replaced."""
     format: Literal["mjcf", "urdf", "usd"] = "mjcf"
     robot: Path | None = None
-    """Robot overlay, as in docs/reference/overlays.md; by default the described robot."""
+    """Folder or name of a robot, or overlay (docs/reference/overlays.md); by default the Jumper."""
 
 
 def run(args: Sequence[str]) -> None:

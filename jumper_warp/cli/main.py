@@ -44,6 +44,7 @@ COMMANDS = {
     "deploy": "Run policies on the robot: jumper deploy BUNDLE --bus BUS.",
     "bus-sim": "Simulate the robot's motors and sensors on its CAN buses.",
     "sysid": "Identify the robot's parameters from recorded motions.",
+    "robot": "Write, check or show a robot of your own: jumper robot new FOLDER.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
     "doctor": "Check the installation: versions, and a step on each device.",

@@ -19,6 +19,7 @@ from jumper_warp.utils.files import Json, json_bytes, write_atomically
 
 if TYPE_CHECKING:
     from jumper_warp.identification.results import Identification
+    from jumper_warp.robot.overlay import RobotOverlay
 
 HELP = f"""\
 usage: jumper sysid [fit] DATA ... [flags]
@@ -58,6 +59,7 @@ class SysidCfg:
     torque_limit: float = 0.0
     """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
     torque_constant: float = 0.0  # [N m/A] Torque at the joint over current, for files with currents
+    robot: Path | None = None  # Folder or name of the robot that moved (default: the Jumper)
     out: Path | None = None  # Folder for the results (default: outputs/sysid/<time>)
     json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print report.json in place of a table
     device: str | None = None  # Warp device
@@ -73,7 +75,7 @@ class ExciteCfg:
     seconds: float = 1.25  # [s] Length of each motion
     num_sets: int = 1  # Number of sets to plan, each of two hung chirps, a standing chirp and a small jump
     solver: Literal["jumper", "mujoco"] = "jumper"  # Physics solver of the robot that is recorded
-    robot: Path | None = None  # Overlay of the robot that is recorded (default: as described)
+    robot: Path | None = None  # Folder, name or overlay of the robot that is recorded (default: the Jumper)
     noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
     no_noise: tyro.conf.FlagCreatePairsOff[bool] = False  # Record without noise
     record_torque: bool = False  # Also record the motors' torques
@@ -120,6 +122,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sysid(parse(SysidCfg, "sysid fit", args[1:] if args[0] == "fit" else args))
 
 
+def robot_of(path: Path | None) -> RobotOverlay:
+    """Return the robot of a flag, by default the Jumper. Raises InputError."""
+    from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+
+    return RobotOverlay({}) if path is None else load_overlay(path)
+
+
 def split_names(text: str) -> list[str]:
     """Return the names in a comma-separated text; empty ones are dropped."""
     return [name for name in text.split(",") if name]
@@ -137,9 +146,11 @@ def sysid(cfg: SysidCfg) -> None:
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    parameters = jumper_parameters(split_names(cfg.params)).without(split_names(cfg.exclude))
+    robot = robot_of(cfg.robot).description
+    parameters = jumper_parameters(split_names(cfg.params), robot).without(split_names(cfg.exclude))
     settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
-    settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std)]
+    settings["description"] = robot
+    settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std, robot)]
     recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
     logs = [path for path in cfg.data if (path / "ticks.bin").is_file()]
     files = [path for path in cfg.data if path not in logs]
@@ -199,23 +210,29 @@ def excite(cfg: ExciteCfg) -> None:
     from jumper_warp.identification.excitation import Scorer, choose, record_motions
     from jumper_warp.identification.recording import KINDS
     from jumper_warp.identification.replay import MotionReplay
-    from jumper_warp.robot.overlay import load_overlay
-    from jumper_warp.robot.values import RobotValues
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    parameters = jumper_parameters(split_names(cfg.params))
-    robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
+    overlay = robot_of(cfg.robot)
+    robots, robot = overlay.robots(), overlay.description
+    parameters = jumper_parameters(split_names(cfg.params), robot)
     configure_device("cpu", cfg.threads)
-    scorer = Scorer(parameters, cfg.noise, MotionReplay(device="cpu", threads=cfg.threads))
+    scorer = Scorer(parameters, cfg.noise, MotionReplay(description=robot, device="cpu", threads=cfg.threads))
     chosen = choose(scorer, KINDS * cfg.num_sets, candidates=cfg.num_candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.no_noise else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
     motions = record_motions(
-        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.record_torque
+        chosen,
+        folder,
+        robots=robots,
+        noise=cfg.noise,
+        solver=cfg.solver,
+        rng=rng,
+        torque=cfg.record_torque,
+        description=robot,
     )
-    mass = float(total_mass(robots)[0])
+    mass = float(total_mass(robots, robot)[0])
     content = json_bytes({"mass_kg": mass} | chosen.to_json())
     write_atomically(folder / "excite.json", content)
     if cfg.json:

@@ -58,8 +58,8 @@ class TrainArgs:
     observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
     without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, written by `jumper sysid fit`. Robots are sampled around its values. Its randomisation ranges
-    override the task's; flags override both."""
+    """Robot: its folder or name, or an overlay. Robots are sampled around its values. Its randomisation ranges override
+    the task's; flags override both."""
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
     minutes."""
@@ -89,7 +89,7 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    recipe, checkpoints = resumed(Recipe.of(name), args)
+    recipe, checkpoints = resumed(Recipe.of(name, overlay_in(args)), args)
     parsed, task = parse_settings(recipe, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")

@@ -195,7 +195,7 @@ class Rollout(Uncopied):
     def geometry(self) -> np.ndarray:
         """Return the lengths [m] that define the geometry of the four legs, which all worlds share.
 
-        Shape (4 legs, 10 `GEOMETRY_NAMES`).
+        Shape (4 legs, 10 `GEOMETRY_NAMES`), of which `shank` is the inner one. A change of it is one of both shanks.
         """
         legs = self.dynamics.robot.geometry.numpy()
         return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
@@ -207,11 +207,12 @@ class Rollout(Uncopied):
         lengths: (4, 10), see `geometry`. Raises InputError: another shape, or not finite.
         """
         lengths = real_array(lengths, "geometry", np.float64)
-        if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
+        legs = self.dynamics.robot.geometry.numpy().copy()
+        if np.shape(lengths) != (len(legs), len(GEOMETRY_NAMES)):
             raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
         if not np.isfinite(lengths).all():
             raise InputError("geometry must be finite")
-        legs = self.dynamics.robot.geometry.numpy().copy()
+        legs["outer_shank"] += lengths[:, GEOMETRY_NAMES.index("shank")] - legs["shank"]
         legs["hip"] = lengths[:, :3]
         for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
             legs[name] = column

@@ -10,7 +10,6 @@ import warp as wp
 
 from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays, Scene
 from jumper_warp.kernels.mdp.view import RobotArrays
-from jumper_warp.robot.description import load_description
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.arrays import real_array
@@ -54,7 +53,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> KernelStruct:
     allocate(robot, ("collisions",), (4, n), int, device)
     allocate(robot, motors, (12, n), float, device)
     allocate(robot, ("prev_lin_vel",), n, wp.vec3, device)
-    robot.default_angle = wp.array(load_description().pose("default"), dtype=float, device=device)
+    robot.default_angle = wp.array(sim.descriptions[0].pose("default"), dtype=float, device=device)
     robot.step_dt = step_dt
     return robot
 

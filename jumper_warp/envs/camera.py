@@ -45,7 +45,7 @@ class WorldCamera:
         shape = find_ground(sim.model)
         self._is_field = shape >= 0 and sim.model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD)
         self._heights = self._ground.heights.numpy()
-        self._shapes = shape_meshes(build_model(1, ground=None, device="cpu"), (0,))
+        self._shapes = shape_meshes(build_model(1, description=sim.descriptions[0], ground=None, device="cpu"), (0,))
         self._num_links = 1 + max(mesh.body for mesh in self._shapes)
         if not self._is_field:
             self._shapes += shape_meshes(sim.model, ())

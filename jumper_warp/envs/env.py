@@ -96,7 +96,7 @@ class Env(Stages):
         block: BlockCfg | None = None,
         skill: np.ndarray | int = 0,
         handovers: Sequence[Handover] = (),
-        robot: RobotOverlay | None = None,
+        robot: RobotOverlay | Sequence[RobotOverlay] | None = None,
         threads: int | None = None,
         refine: int = 1,
     ):
@@ -106,8 +106,9 @@ class Env(Stages):
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, else the tasks'
         sampled ground (SolverJumper with randomize), else a plane. skill: index of each world's first task, (num_envs,)
-        or one for all. robot: differences from the robot description, around which robots are randomised
-        (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
+        or one for all. robot: a robot (`load_overlay`), around which robots are randomised
+        (`jumper_warp.tasks.overlay_ranges`), or several, which worlds take in turn.
+        threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
@@ -126,11 +127,12 @@ class Env(Stages):
         self.seed = seed
         self.auto_reset = auto_reset
         self.handovers = tuple(handovers)
-        self.overlay = robot
+        self.robots = [] if robot is None else [robot] if isinstance(robot, RobotOverlay) else list(robot)
+        self.overlay = self.robots[0] if self.robots else None
         self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        check_type("robot (see load_overlay)", robot, RobotOverlay | None)
-        own = [with_own_ranges(each, robot) if randomize else each for each in tasks]
+        check_type("robot (see load_overlay)", self.overlay, RobotOverlay | None)
+        own = [with_own_ranges(each, self.overlay) if randomize else each for each in tasks]
         run = [each.in_conditions(randomize=randomize, noise=noise, ground_may_vary=may_vary) for each in own]
         self._draws_ground = any(each.draws_ground for each in run)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
@@ -142,7 +144,7 @@ class Env(Stages):
             self.sim = Simulation(
                 num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
                 block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-                friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot,
+                friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot or None,
                 threads=threads, dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine,
                 keep_momentum=any(each.keep_momentum for each in tasks),
             )  # fmt: skip
@@ -160,7 +162,7 @@ class Env(Stages):
         self.step_hooks: list[Callable[[], None]] = []
         """Functions that `step` calls last, also within a captured graph; they must not change the environment."""
         self.gradients_of_step: EnvGradients | None = None
-        self._allocate(run, skill, handovers, moves_of(robot))
+        self._allocate(run, skill, handovers, moves_of(self.overlay))
         self._show()
 
     def _show(self) -> None:
@@ -503,7 +505,7 @@ class Env(Stages):
         """
         config = {
             "task": task_to_json(self.task),
-            "interface": interface(self.task),
+            "interface": interface(self.task, self.sim.descriptions[0]),
             "num_envs": self.num_envs,
             "seed": self.seed,
             "physics_dt_s": self.physics_dt,

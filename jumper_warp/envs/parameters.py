@@ -21,7 +21,7 @@ NOMINAL = {
     "body_mass": "mass", "body_com": "com", "body_inertia": "inertia", "body_inv_inertia": "inv_inertia",
     "joint_armature": "armature",
 }  # fmt: skip
-"""Arrays of the model whose values of one world are copied to `nominal_<value>`."""
+"""Arrays of the model whose values of one world of each robot are copied to `nominal_<value>`."""
 
 
 def robot_parameters(
@@ -40,8 +40,9 @@ def robot_parameters(
         setattr(robot, name, getattr(model, name))
     for name, short in NOMINAL.items():
         array = getattr(model, name)
-        first_world = array.numpy()[: int(BODIES) if name.startswith("body") else int(DOFS)]
-        setattr(robot, f"nominal_{short}", wp.array(first_world, dtype=array.dtype, device=device))
+        count = int(BODIES) if name.startswith("body") else int(DOFS)
+        first_worlds = array.numpy()[: count * min(len(sim.descriptions), n)]  # one of each robot
+        setattr(robot, f"nominal_{short}", wp.array(first_worlds, dtype=array.dtype, device=device))
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
     robot.static_ratio = sim.dynamics.static_friction_ratio

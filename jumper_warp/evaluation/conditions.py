@@ -39,7 +39,7 @@ class Conditions:
     device: str | None = None  # Warp device (default: a GPU if there is one)
     threads: int | None = None  # CPU threads (default: all cores); results do not depend on it
     robot: Path | None = None
-    """Robot overlay file, as written by `jumper sysid fit` (default: the overlay of the training, if it had one)."""
+    """Folder or name of a robot, or overlay, as `jumper sysid fit` writes it (default: the robot of the training)."""
     push_in_flight: bool = False  # In randomised tests, push the robot in flight too, not only while a paw is down
     latency: float | None = None
     """[ms] Latency from action to motor, rounded to a physics step (default: none, or sampled if randomised)."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
+from jumper_warp.sim.apex import HOLD, LEVELS, RAMP, STAND
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
 from jumper_warp.utils.progress import phase
@@ -15,12 +16,6 @@ from jumper_warp.utils.progress import phase
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
-STAND = 31  # Policy steps in the default pose before the ramp, as many as before the command in a sweep
-COAST = 30  # Policy steps after the extension, within which the apex has passed
-LEVELS = np.repeat([0.0, np.nan, 1.0, -1.0, 0.0], [STAND, RAMP, HOLD, EXTEND, COAST])
-LEVELS[STAND : STAND + RAMP] = np.arange(RAMP) / RAMP
-"""[1] Action of the transversal motors at every policy step of the open-loop jump: 1 squat, -1 extension."""
 PUSH_PROBABILITY = "events.push.probability"
 
 

@@ -58,7 +58,9 @@ class EnvRecorder:
         self.log = log
         self.worlds = list(worlds)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
-        model = build_model(len(worlds), ground=ground, device=env.wp_device, mujoco=False)
+        robots = env.sim.descriptions
+        robots = [robots[world % len(robots)] for world in worlds] if len(robots) > 1 else robots
+        model = build_model(len(worlds), description=robots, ground=ground, device=env.wp_device, mujoco=False)
         labels = log.names(self.worlds)
         notes = {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)

@@ -5,6 +5,7 @@ Experiments and the commands `jumper evaluate` and `jumper play` use this module
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,6 +23,7 @@ from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.skills import WALK, SkillNames
 from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
@@ -84,6 +86,7 @@ class Run(ABC):
     """Base class of evaluations: runs and records episodes, reports metrics; subclasses define `actor`, the policy."""
 
     folder: Path  # Output folder, set by `prepare`
+    trained_robot: RobotOverlay | None = None  # Robot of the policy's training; None: the Jumper, or several policies
     source: str | Path = "several policies"  # Name or folder of a policy, a run's folder, or a checkpoint
 
     def __init__(self) -> None:
@@ -96,6 +99,7 @@ class Run(ABC):
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
         self.name = ""  # Name of the evaluation
         self.print_flags = PrintFlags()  # Selects what `report` prints
+        self._announced = ""  # Name of the robot that was announced as another one than that of the training
         self.settings: Json = {}  # Settings of task, robot and test, reported with the conditions
         self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
@@ -166,6 +170,10 @@ class Run(ABC):
 
     def note_robot(self, env: Env) -> None:
         """Store, for the report, an environment's robot overlay (values of one robot) and randomisation ranges."""
+        trained, robot = (self.trained_robot or RobotOverlay({})).description, env.sim.descriptions[0]
+        if robot.name not in (trained.name, self._announced):
+            self._announced = robot.name
+            print(f"jumper: {self.source} was trained on {trained.name}; the robot is {robot.name}", file=sys.stderr)
         if env.overlay is None:
             return
         if self.conditions.robot is None:
@@ -252,6 +260,7 @@ class EvaluationRun(Run):
         self.policy = Policy.load(source)
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
+        self.trained_robot = self.recipe.robot
         self.evaluation = self.task.evaluation
         self.settings = {"task": self.task.name, **trained_range(self.task)}
 

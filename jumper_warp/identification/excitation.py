@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
+from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
 from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
@@ -27,10 +29,11 @@ MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of a free base's origin above t
 MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 
-def unsafe_reason(plan: Plan, record: Record) -> str:
+def unsafe_reason(plan: Plan, record: Record, size: float = 1.0) -> str:
     """Return the reason why a simulated identification motion is unsafe, or an empty string if it is safe.
 
-    plan: its motor targets; record: motion of one world. Limits of motor angles are the walking filter's.
+    plan: its motor targets; record: motion of one world; size [1]: of the robot's thighs, relative to the Jumper's.
+    Limits of motor angles are the walking filter's.
     """
     limits = walking_filter()
     angle = record.angle[..., 0] / DEGREES
@@ -53,9 +56,9 @@ def unsafe_reason(plan: Plan, record: Record) -> str:
         tilt = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0))).max()
         if tilt > MAX_TILT:
             return f"the base leans by {tilt:.0f} deg"
-        if record.position[:, 2].max() > MAX_HEIGHT:
+        if record.position[:, 2].max() > size * MAX_HEIGHT:
             return f"the base rises to {record.position[:, 2].max():.2f} m"
-        if record.position[:, 2].min() < MIN_HEIGHT:
+        if record.position[:, 2].min() < size * MIN_HEIGHT:
             return "the base comes close to the ground"
     return ""
 
@@ -126,13 +129,17 @@ def choose(
     plans = []
     gains = []
     refused = []
+    robots = (scorer.replay.description, load_description())
+    # [N m] the Jumper's, in proportion to the peak torque
+    torque_limit = 12.0 * operator.truediv(*(robot.motors[1].peak_torque for robot in robots))
+    size = operator.truediv(*(leg_dimensions(robot, "FL").thigh for robot in robots))
     with phase("planning motions", len(kinds) * candidates) as advance:
         for kind in kinds:
             best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
             for _ in range(candidates):
-                plan = sample_plan(kind, rng, seconds)
+                plan = sample_plan(kind, rng, seconds, torque_limit)
                 record = scorer.record(plan)
-                if reason := unsafe_reason(plan, record):
+                if reason := unsafe_reason(plan, record, size):
                     refused.append(f"{kind}: {reason}")
                 else:
                     after = information + scorer.information(plan, record)
@@ -157,16 +164,18 @@ def record_motions(
     solver: SolverName = "jumper",
     rng: np.random.Generator | None = None,
     torque: bool = False,
+    description: RobotDescription | None = None,
 ) -> list[RecordedMotion]:
     """Record chosen motions on a simulated robot, and write each to `folder` as `<number>_<kind>.npz`. Returns them.
 
-    robots: the robot, N = 1. solver: physics solver. noise, rng, torque: see `measure`. Raises OSError.
+    robots: values of the robot, N = 1; description: by default the Jumper's. solver: physics solver.
+    noise, rng, torque: see `measure`. Raises OSError.
     """
     motions = []
     with phase("recording motions", len(chosen.plans)) as advance:
         for i, plan in enumerate(chosen.plans):
             name = f"{i}_{plan.kind.replace(' ', '_')}"
-            record = simulate_plan(plan, solver=solver, robots=robots)
+            record = simulate_plan(plan, solver=solver, robots=robots, description=description)
             motions.append(measure(plan, name, record, robots, rng, noise, torque=torque))
             motions[-1].save(folder / f"{name}.npz")
             advance()

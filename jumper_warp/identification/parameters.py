@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
-from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, TRANSVERSAL, RobotValues
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
@@ -191,9 +192,12 @@ def relative(
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
     """Return the parameters of motors: kp, kd, armature of each; torque limit, cutoff, no-load speed of each kind."""
     parameters = []
+    nominal = RobotValues.nominal(1, robot)
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
+        values = getattr(nominal, quantity)[0]
         parameters += [
-            relative(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+            relative(f"{quantity}/{j}", quantity, (i,), "1", float(values[i]), prior, "motors")
+            for i, j in enumerate(MOTOR_JOINTS)
         ]
     for i, joint in enumerate(MOTOR_JOINTS):
         parameters.append(
@@ -248,22 +252,25 @@ class PriorMeasurement:
     std: float  # standard deviation of the measurement, in the same unit
 
 
-def total_mass(robots: RobotValues) -> np.ndarray:
-    """Return the total mass of each of N robots [kg], (N,)."""
-    leg = [load_description().link(f"FL_{kind}").mass for kind in LINK_KINDS]
-    return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ np.array(leg)
+def total_mass(robots: RobotValues, description: RobotDescription | None = None) -> np.ndarray:
+    """Return the total mass of each of N robots [kg], (N,); description: by default the Jumper's."""
+    robot = load_description() if description is None else description
+    legs = [sum(robot.link(f"{leg}_{kind}").mass for leg in LEGS) for kind in LINK_KINDS]
+    return robots.base_mass[:, 0] + robots.link_mass @ np.array(legs)
 
 
-def weighed_mass(mass: float, std: float = 0.02) -> PriorMeasurement:
+def weighed_mass(mass: float, std: float = 0.02, description: RobotDescription | None = None) -> PriorMeasurement:
     """Return the weighed mass of the whole robot [kg] as a prior measurement; std [kg]: of the scale.
+
+    description: as in `total_mass`.
 
     Raises InputError: std is not positive, or the mass is not within 0.5 to 2 times the described one.
     """
-    described = float(total_mass(RobotValues.nominal(1))[0])
+    described = float(total_mass(RobotValues.nominal(1, description), description)[0])
     if not 0.5 * described <= mass <= 2.0 * described:
         raise InputError(
             f"weighed mass must be in {0.5 * described:.4g} to {2.0 * described:.4g} kg (the robot is described with "
             f"{described:.4g} kg), got {mass:.6g} kg"
         )
     check_within("deviation of the weighed mass", np.array([std]), (1.0e-6, 10.0))
-    return PriorMeasurement("total mass", total_mass, mass, std)
+    return PriorMeasurement("total mass", partial(total_mass, description=description), mass, std)

@@ -13,7 +13,7 @@ from jumper_warp.identification.initial_states import HANGING_HEIGHT, InitialSta
 from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import channel_noise
-from jumper_warp.robot.description import load_description
+from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
@@ -139,19 +139,22 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
 
 
 def simulate_plan(
-    plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
-) -> Record:
+    plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0,
+    description: RobotDescription | None = None,
+) -> Record:  # fmt: skip
     """Simulate one robot under planned motor targets from rest with any solver, and return its motion at 240 Hz.
 
-    robots: N = 1, by default as described. dt [s]: physics step. Raises InputError: dt does not divide 1/240 s.
+    robots: N = 1, by default as described; description: by default the Jumper's. dt [s]: physics step.
+    Raises InputError: dt does not divide 1/240 s.
     """
     period = TICK / SAMPLES
     stride = round(period / dt)
     if stride < 1 or abs(stride * dt - period) > 1.0e-6 * period:
         raise InputError(f"dt must divide 1/240 s, got {dt}")
-    robots = RobotValues.nominal(1) if robots is None else robots
+    description = load_description() if description is None else description
+    robots = RobotValues.nominal(1, description) if robots is None else robots
     held = plan.base == "fixed"
-    sim = _make_simulation(plan, solver, robots, dt, held)
+    sim = _make_simulation(plan, solver, robots, dt, held, description)
     rows = plan.rows
     rest = round(REST / period)
     target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
@@ -179,7 +182,9 @@ def simulate_plan(
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 
-def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool) -> Simulation:
+def _make_simulation(
+    plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool, description: RobotDescription
+) -> Simulation:
     """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base.
 
     So any solver can hold the base; a force cancels its weight.
@@ -188,12 +193,15 @@ def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: fl
     if held:
         values.base_mass[:] = HELD_MASS
         values.base_com[:] = 0.0
-    motors = MotorCfg.from_description(load_description(), "jumping", plan.torque_limit, plan.torque_limit)
-    sim = Simulation(1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, device="cpu", threads=1)
+    motors = MotorCfg.from_description(description, "jumping", plan.torque_limit, plan.torque_limit)
+    sim = Simulation(
+        1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, description=description, device="cpu",
+        threads=1,
+    )  # fmt: skip
     angle = plan.target[0] - values.offset[0]
     q = sim.joint_q()[0].copy()
     q[7 + motor_values(np.arange(20))] = angle
-    height = stance(load_description(), angle[None], np.zeros((1, 12))).height[0]
+    height = stance(description, angle[None], np.zeros((1, 12))).height[0]
     q[:3] = [0.0, 0.0, HANGING_HEIGHT if held else height + 1.0e-3]
     sim.state.joint_q.assign(q.astype(np.float32))
     sim.write_bodies()

@@ -91,7 +91,8 @@ def identified_overlay(result: Identification, source: str = "") -> RobotOverlay
     source: text on the origin of the values, for the overlay.
     """
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
-    return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
+    fields = {"randomization": randomization_ranges(result), "source": source}
+    return overlay_of(result.robots(), quantities, robot=result.motions[0].description.table, **fields)
 
 
 def randomization_ranges(result: Identification) -> dict[str, tuple[float, float]]:

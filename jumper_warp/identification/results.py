@@ -196,7 +196,7 @@ class Identification:
 
     def robots(self, count: int = 1) -> RobotValues:
         """Return `count` copies of the identified robot, one row for each world."""
-        return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
+        return self.parameters.robots(np.repeat(self.z[None], count, axis=0), self.motions[0].description)
 
 
 class ChannelError(NamedTuple):

@@ -67,7 +67,7 @@ class Page:
     def draw_ground(self) -> None:
         """Draw the robot and the session's ground, in place of those drawn before."""
         ground = "plane" if self.session.field is None else self.session.field
-        model = build_model(1, ground=ground, device="cpu", mujoco=False)
+        model = build_model(1, description=self.session.env.sim.descriptions, ground=ground, device="cpu", mujoco=False)
         self.scene = ViserScene(self.server.scene, shape_meshes(model, (0,)))
         self.model = model
         self.shown_goal: np.ndarray | None = None

@@ -13,6 +13,7 @@ import numpy as np
 from jumper_warp.utils.rotations import CONJUGATE, multiply, rotate
 
 if TYPE_CHECKING:
+    from jumper_warp.robot.parts import RobotDescription
     from jumper_warp.utils.newton_types import Model
     from jumper_warp.viz.shapes import ShapeMesh
 
@@ -67,15 +68,15 @@ class RobotScene:
         return np.concatenate([knee, multiply(housing[..., 3:], turn)], axis=-1)
 
 
-def robot_scene(model: Model) -> RobotScene:
-    """Return the scene of a simulation's model: drawn shapes of the described robot, the ground, the model's legs."""
+def robot_scene(model: Model, robot: RobotDescription | None = None) -> RobotScene:
+    """Return the scene of a simulation's model: drawn shapes of the robot (default: Jumper), the ground, the legs."""
     from jumper_warp.robot.model import build_model
     from jumper_warp.viz.shapes import shape_meshes
 
     start = np.asarray(model.joint_qd_start.numpy()[1:21], dtype=int)  # joint 0 is the base's, the ankles are the last
     anchors = model.joint_X_p.numpy()[:, :3]
     return RobotScene(
-        tuple(shape_meshes(build_model(1, device="cpu", mujoco=False), (0,))),
+        tuple(shape_meshes(build_model(1, description=robot, device="cpu", mujoco=False), (0,))),
         tuple(label.split("/")[-1] for label in model.body_label[:21]), anchors[1:21].reshape(4, 5, 3),
         model.joint_axis.numpy()[start].reshape(4, 5, 3), float(np.linalg.norm(anchors[-1])),
     )  # fmt: skip

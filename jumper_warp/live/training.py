@@ -67,7 +67,7 @@ def setup_of(buffer: WorldBuffer, folders: Sequence[Path], elapsed: float, **set
     return Setup(
         folders=tuple(folders),
         titles=tuple(map(title, folders)),
-        scene=robot_scene(env.sim.model),
+        scene=robot_scene(env.sim.model, env.sim.descriptions[0]),
         layout=buffer.layout,
         terms=tuple(term.name for term in task.rewards),
         endings=task.termination_names,

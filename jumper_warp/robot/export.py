@@ -36,7 +36,8 @@ def export_robot(
     """
     check_type("kind", kind, RobotFormat)
     folder = Path(folder)
-    description = load_description() if description is None else description
+    if description is None:
+        description = load_description() if overlay is None else overlay.description
     values = RobotValues.nominal(1, description) if overlay is None else overlay.robots(description)
     robot = described(values, description)
     if kind == "usd":
@@ -50,7 +51,7 @@ def export_robot(
         text = mjcf(description, values)
     else:
         path = folder / "jumper.urdf"
-        text = description.urdf if overlay is None else urdf(robot)
+        text = description.urdf if overlay is None and description.table is None else urdf(robot)
         write_atomically(folder / "loop_closures.yaml", loop_closures(robot, standing_angles(robot)).encode())
     write_atomically(path, text.encode())
     return path

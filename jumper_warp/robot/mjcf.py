@@ -25,7 +25,7 @@ from jumper_warp.robot.values import RobotValues, described
 STIFFEST = 0.001  # [s] Time constant of loops and stops, which MuJoCo raises to two of its time steps
 GROUND_EDGE = 20.0  # [m] Half the edge of the ground that viewers draw; the plane itself has no end
 ABOUT = """
-  The robot Jumper, written by the command `jumper export robot`. SI units, angles in radians, quaternions wxyz.
+  The robot {name}, written by the command `jumper export robot`. SI units, angles in radians, quaternions wxyz.
   data.ctrl: targets of the 12 motors [rad], legs FL, FR, BL, BR, each lateral, outer, inner. The other 8 actuators
   are the dampers of the passive knees: leave their control at 0. Keyframe "default" is the standing pose.
   At qpos = 0 the loops are open: start from the keyframe.
@@ -41,7 +41,7 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
     values = RobotValues.nominal(1, description) if values is None else values
     robot = described(values, description)
     root = Element("mujoco", model="jumper")
-    root.append(Comment(ABOUT))
+    root.append(Comment(ABOUT.format(name=robot.name)))
     add(root, "compiler", angle="radian", meshdir="meshes", autolimits="true")
     # Euler applies the motors' damping explicitly, as this project does on SolverMuJoCo
     add(root, "option", timestep=PHYSICS_DT, integrator="Euler", cone="pyramidal")

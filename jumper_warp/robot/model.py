@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, cast
 
@@ -20,7 +20,7 @@ import warp as wp
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH, check_gravity
-from jumper_warp.robot.legs import LegDimensions, knee_angles, leg_dimensions
+from jumper_warp.robot.legs import knee_angles, leg_dimensions
 from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.checks import check_count, check_flags, check_number, check_type
@@ -60,7 +60,7 @@ Extras = Callable[[newton.ModelBuilder], Any]
 def build_model(
     num_worlds: int,
     *,
-    description: RobotDescription | None = None,
+    description: RobotDescription | Sequence[RobotDescription] | None = None,
     ground: str | newton.Heightfield | None = "plane",
     friction: float = 0.9,
     gravity: float = EARTH,
@@ -73,7 +73,7 @@ def build_model(
     """Return a Newton model of `num_worlds` robots, standing in the default pose; labels start with `world_i/`.
 
     Args:
-        description: The robot; by default the project's own.
+        description: The robot; by default the project's own. Worlds take several robots in turn.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
         gravity: Downward gravity of all worlds [m/s^2]; `model.gravity`, (num_worlds + 1,) vec3, can differ by world.
@@ -96,21 +96,56 @@ def build_model(
     check_flags(visuals=visuals, mujoco=mujoco)
     check_number("friction", friction, 0.0, MAX_FRICTION)
     check_gravity(gravity)
-    check_type("description", description, RobotDescription | None)
+    descriptions = described_robots(description)
     check_type("extras", extras, Callable | None)
     check_type("robot", robot, RobotValues | None)
     init_warp()
-    description = load_description() if description is None else description
     builder = _empty_builder(gravity, mujoco)
-    one = _robot_builder(description, friction, _empty_builder(gravity, mujoco), visuals)
+    one = _robot_builder(descriptions[0], friction, _empty_builder(gravity, mujoco), visuals)
     if extras is not None:
         extras(one)
     builder.replicate(one, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
     model = cast(Model, builder.finalize(device=device))
+    if len(descriptions) > 1:
+        _write_robots(model, descriptions)
     if robot is not None:
         _write_values(model, robot)
     return model
+
+
+def described_robots(description: RobotDescription | Sequence[RobotDescription] | None) -> list[RobotDescription]:
+    """Return the robots of an argument `description`, by default the project's own. Raises InputError."""
+    check_type("description", description, RobotDescription | Sequence | None)
+    if description is None or isinstance(description, RobotDescription):
+        return [load_description() if description is None else description]
+    robots = list(description)
+    for name in ("poses", "transversal_sum", "knee_damping_limit", "knee_damping", "motors"):
+        if any(getattr(robot, name) != getattr(robots[0], name) for robot in robots):
+            raise InputError(f"robots of one environment must have equal {name}")
+    return robots
+
+
+def _write_robots(model: Model, robots: list[RobotDescription]) -> None:
+    """Write masses, lengths, joints and standing poses of robots, which worlds take in turn, to a model of the first.
+
+    Shapes that only viewers see stay those of the first robot.
+    """
+    builders = [_robot_builder(robot, 0.0, _empty_builder(0.0, False), False) for robot in robots]
+    n = model.world_count
+    turns = np.arange(n) % len(robots)
+    for name in ("body_mass", "body_com", "body_inertia", "joint_X_p", "joint_X_c", "joint_armature", "joint_friction",
+                 "joint_limit_lower", "joint_limit_upper", "joint_q"):  # fmt: skip
+        each = np.array([np.array([np.array(row) for row in getattr(one, name)]) for one in builders], dtype=np.float32)
+        getattr(model, name).assign(each[turns].reshape(getattr(model, name).numpy().shape))
+    model.body_inv_mass.assign(1.0 / model.body_mass.numpy())
+    model.body_inv_inertia.assign(np.linalg.inv(model.body_inertia.numpy().astype(np.float64)).astype(np.float32))
+    paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
+    for name in ("shape_transform", "shape_scale"):
+        values = getattr(model, name).numpy()
+        each = np.array([np.array([np.array(row) for row in getattr(one, name)]) for one in builders], dtype=np.float32)
+        values[paws] = each[turns].reshape(len(paws), -1)
+        getattr(model, name).assign(values)
 
 
 def _write_values(model: Model, robots: RobotValues) -> None:
@@ -172,14 +207,15 @@ def leg_geometry(description: RobotDescription) -> list[dict]:
 
 
 def leg_geometry_array(
-    description: RobotDescription, geometry_module: ModuleType, device: wp.DeviceLike = None
-) -> wp.array:
-    """Return the legs' geometry as an array (4,) of the kernels' struct `LegGeometry`.
+    description: RobotDescription | Sequence[RobotDescription], geometry_module: ModuleType,
+    device: wp.DeviceLike = None,
+) -> wp.array:  # fmt: skip
+    """Return the legs' geometry as an array (4 robots,) of the kernels' struct `LegGeometry`.
 
     geometry_module: kernel module that defines the struct, in single or double precision.
     """
     legs = []
-    for fields in leg_geometry(description):
+    for fields in (fields for robot in described_robots(description) for fields in leg_geometry(robot)):
         leg = geometry_module.LegGeometry()
         for name, value in fields.items():
             setattr(leg, name, value)
@@ -198,23 +234,14 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
     depths = []
     for name, (lateral, outer, inner) in zip(LEGS, angles, strict=True):
         leg = leg_dimensions(description, name)
-        outer_knee, inner_knee, ankle_z = knee_angles(leg, outer, inner)
+        outer_knee, inner_knee, _ = knee_angles(leg, outer, inner)
         joints += [lateral, outer, outer_knee, inner, inner_knee]
         # both shanks turn about the housing's y, the outer one by front * (knee - thigh), the inner one the other way
         half_turn = 0.5 * leg.front * (outer_knee - outer + inner_knee - inner)
         loops += [0.0, math.sin(half_turn), 0.0, math.cos(half_turn)]
-        depths.append(_paw_depth(leg, lateral, ankle_z))
+        depths.append(leg.depth(lateral, outer) - leg.hip[2])
     base = [0.0, 0.0, max(depths), 0.0, 0.0, 0.0, 1.0]
     return np.array(base + joints + loops)
-
-
-def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
-    """Return the depth [m] of a paw's lowest point below the hips of a level base.
-
-    lateral: motor angle [rad]; ankle_z: height of the ankle in the housing frame [m], negative below the hip.
-    """
-    ankle_y = leg.plane_y + leg.knee_y
-    return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
 
 
 def _empty_builder(gravity: float, mujoco: bool) -> newton.ModelBuilder:

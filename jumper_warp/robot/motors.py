@@ -91,13 +91,11 @@ class MotorCfg:
         lateral_torque: float,
         transversal_torque: float,
     ) -> MotorCfg:
-        """Return the description's motors with its jumping or walking gains and the given torque limits [N m].
+        """Return the left front leg's motors with its jumping or walking gains and the given torque limits [N m].
 
-        A limit is cut to the motor's peak torque. Raises InputError if the motors of one kind are not of one type.
+        A limit is cut to the motor's peak torque. `RobotValues` has the ratios of other motors to these.
         """
         motors = description.motors
-        if len({*motors[0::3]}) > 1 or len({*motors[1::3], *motors[2::3]}) > 1:
-            raise InputError(f"{description.path}: the lateral motors, and the transversal ones, must be of one type")
         return cls(motor_kind(motors[0], gains, lateral_torque), motor_kind(motors[1], gains, transversal_torque))
 
 
@@ -152,7 +150,7 @@ def motor_arrays(
     motors.fade_start = cfg.fade_start
     motors.fade_end = cfg.fade_end
     if robot is not None:
-        for name in ("kp", "kd", "saturation"):
+        for name in ("kp", "kd", "saturation", "peak"):
             array = getattr(motors, name)
             array.assign((array.numpy() * getattr(robot, name).T).astype(np.float32))
         for name in ("no_load_speed", "cutoff_speed", "offset"):

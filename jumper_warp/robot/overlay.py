@@ -5,6 +5,8 @@ An identification writes one for each real robot, which differs a little from it
 
 from __future__ import annotations
 
+import copy
+import functools
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -16,14 +18,18 @@ import numpy as np
 
 from jumper_warp.robot import bounds
 from jumper_warp.robot.bounds import Range
-from jumper_warp.robot.description import RobotDescription
+from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.folder import FILE, read_robot, robot_of, stretch, table_of
+from jumper_warp.robot.folder import SCHEMA as ROBOT_SCHEMA
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.arrays import real_array
+from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import read_json, write_atomically
+from jumper_warp.utils.files import Json, read_json, write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
+ROBOTS = ASSETS / "robots"  # Folder of the project's robots beside the Jumper, found by their names
 RATIO = Range(0.05, 3.0, "times the described value")
 RANGES = {
     "base_mass": bounds.LINK_MASS,
@@ -35,6 +41,7 @@ RANGES = {
     "kp": RATIO,
     "kd": RATIO,
     "saturation": RATIO,
+    "peak": RATIO,
     "no_load_speed": bounds.MOTOR_SPEED,
     "cutoff_speed": bounds.MOTOR_SPEED,
     "offset": Range(-0.5, 0.5, "rad"),
@@ -45,7 +52,9 @@ RANGES = {
     "spring_length": bounds.SPRING_LENGTH,
 }
 """Allowed values by field of `RobotValues`."""
-SECTIONS = ("schema", "source", "values", "randomization")
+LENGTHS = {"thigh_length": ("thigh",), "shank_length": ("outer_shank", "inner_shank")}
+"""Quantities of a robot table by length [m] of an overlay, which has one value for all legs, or front and back."""
+SECTIONS = ("schema", "source", "robot", "values", "randomization")
 RANDOMIZED = {
     "static_friction": RANGES["paw_friction"],
     "dynamic_friction": RANGES["paw_friction"],
@@ -73,11 +82,13 @@ class RobotOverlay:
     """Values of one robot that replace those of the description, and randomisation ranges around them."""
 
     values: Mapping[str, tuple[float, ...]]
-    """By field of `RobotValues`, its values for one robot, in its unit."""
+    """By field of `RobotValues`, its values for one robot, in its unit, and lengths by name in `LENGTHS`."""
     randomization: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """By field of `RandomizationCfg`, (lower, upper) in the field's unit and meaning: factor, offset or value."""
     source: str = ""
     """Origin of the values, free text."""
+    robot: Json | None = None
+    """Table of the robot that the values differ from, as in the `robot.json` of its folder; None: the Jumper."""
 
     def __post_init__(self) -> None:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
@@ -86,10 +97,16 @@ class RobotOverlay:
             pairs = {key: tuple(np.asarray(row).tolist()) if np.ndim(row) == 1 else row
                      for key, row in getattr(self, name).items()}  # fmt: skip
             object.__setattr__(self, name, pairs)
-        check_names("quantity", self.values, RANGES)
+        check_names("quantity", self.values, (*RANGES, *LENGTHS))
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))
+        for name in LENGTHS:
+            values = self.values.get(name, (0.1,))
+            if not len(values) <= 2 or not all(0.01 <= value <= 1.0 for value in values):
+                raise InputError(f"robot overlay: {name} must be one or two lengths in 0.01 to 1 m, got {values}")
         for name, values in self.values.items():
+            if name in LENGTHS:
+                continue
             shape = real_array(values, f"robot overlay: {name}").shape
             if shape != nominal[name].shape[1:]:
                 raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got shape {shape}")
@@ -102,11 +119,33 @@ class RobotOverlay:
         if not (robot.cutoff_speed < robot.no_load_speed).all():
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
+    @functools.cached_property
+    def description(self) -> RobotDescription:
+        """Description of the robot with the overlay's lengths; its other values are those of `robots`.
+
+        A link of another length keeps its mass; its centre of mass and its inertia grow with the length.
+        """
+        lengths = {name: self.values[name] for name in LENGTHS if name in self.values}
+        if not lengths:
+            return load_description() if self.robot is None else robot_of(self.robot)
+        table = table_of(load_description(), "Jumper") if self.robot is None else copy.deepcopy(self.robot)
+        for name, values in lengths.items():
+            for end, value in zip(("front", "back"), 2 * values, strict=False):
+                for quantity in LENGTHS[name]:
+                    stretch(table[end], quantity, value)
+        return robot_of({**table, "name": f"{table['name']} with other lengths"})
+
+    @property
+    def is_jumper(self) -> bool:
+        """Whether the robot has the Jumper's lengths, so that tasks have the Jumper's numbers."""
+        return self.robot is None and not any(name in self.values for name in LENGTHS)
+
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
         """Return the complete values of the overlay's one robot; values that it lacks come from the description."""
-        robot = RobotValues.nominal(1, description)
+        robot = RobotValues.nominal(1, self.description if description is None else description)
         for name, values in self.values.items():
-            getattr(robot, name)[0] = values
+            if name not in LENGTHS:
+                getattr(robot, name)[0] = values
         return robot
 
     @property
@@ -119,6 +158,7 @@ class RobotOverlay:
         return {
             "schema": SCHEMA,
             "source": self.source,
+            **({} if self.robot is None else {"robot": self.robot}),
             "values": {name: list(values) for name, values in self.values.items()},
             "randomization": {name: list(pair) for name, pair in self.randomization.items()},
         }
@@ -138,7 +178,7 @@ class RobotOverlay:
             if not isinstance(table, dict):
                 raise InputError(f"robot overlay: {section} must be an object")
             sections[section] = {name: finite_tuple(f"{section} {name}", values) for name, values in table.items()}
-        return cls(**sections, source=str(saved.get("source", "")))
+        return cls(**sections, source=str(saved.get("source", "")), robot=saved.get("robot"))
 
     def save(self, path: Path) -> None:
         """Write the overlay as a JSON file. Raises OSError."""
@@ -180,12 +220,20 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 
 
 def load_overlay(path: Path) -> RobotOverlay:
-    """Read a robot overlay from a JSON file.
+    """Read a robot: its folder or `robot.json`, an overlay, or an overlay whose `robot` is the folder beside it.
 
-    Raises InputError: it cannot be read, or is no overlay.
+    Raises InputError: it cannot be read, or is neither.
     """
+    if not Path(path).exists() and (ROBOTS / path / FILE).is_file():
+        path = ROBOTS / path
+    if Path(path).is_dir():
+        return RobotOverlay({}, robot=read_robot(Path(path)))
     content = read_json(path, "robot overlay, as jumper sysid fit writes it")
+    if isinstance(content, dict) and content.get("schema") == ROBOT_SCHEMA:
+        return RobotOverlay({}, robot=read_robot(Path(path)))
     try:
+        if isinstance(content, dict) and isinstance(content.get("robot"), str):
+            content["robot"] = read_robot(Path(path).parent / content["robot"])
         return RobotOverlay.from_json(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -106,6 +106,18 @@ class Motor:
         return self.rotor_inertia * self.gear_ratio**2
 
 
+@dataclass(frozen=True)
+class Hull:
+    """Sizes of the capsules and the shell that collisions of links are tested with; the defaults are the Jumper's."""
+
+    thigh_radius: float = 0.019  # [m]
+    shank_radius: float = 0.012  # [m]
+    housing_radius: float = 0.048  # [m]
+    housing_length: float = 0.19  # [m] from the hip outward along the lateral axis
+    shell: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """[1] Length, width and height of the body's shell as factors on the Jumper's."""
+
+
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
     """Description of a robot: links, joints, loops, motors and poses; `dataclasses.replace` returns a changed copy."""
@@ -125,6 +137,12 @@ class RobotDescription:
     """[rad] Lower and upper stop of the sum outer + inner angle of a leg."""
     poses: Mapping[str, tuple[float, float]]
     """(lateral, transversal) angle [rad] of every leg by name of the pose; outer and inner are both transversal."""
+    name: str = "Jumper"
+    spring: tuple[float, float] = (0.0, 0.0)
+    """Stiffness [N/m], 0: none, and rest length [m] of a spring between the knees of each leg."""
+    hull: Hull = Hull()
+    table: Mapping[str, Any] | None = None
+    """Content of the file `robot.json` that the description was made from; None: of a URDF."""
 
     @property
     def mass(self) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from collections.abc import Sequence
 from numbers import Integral
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -24,9 +25,9 @@ from jumper_warp.kernels.dynamics.restore import (
     restore_state_kernel,
 )
 from jumper_warp.kernels.layout import COORDS
-from jumper_warp.robot.description import LEGS, RobotDescription, load_description
+from jumper_warp.robot.description import LEGS, RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.model import leg_geometry_array, other_colliders
+from jumper_warp.robot.model import described_robots, leg_geometry_array, other_colliders
 from jumper_warp.sim.precision import KernelModules, kernel_modules
 from jumper_warp.utils.checks import check_count, check_number, check_positive, check_type
 from jumper_warp.utils.errors import InputError
@@ -244,7 +245,7 @@ class JumperDynamics:
         self,
         model: Model,
         *,
-        description: RobotDescription | None = None,
+        description: RobotDescription | Sequence[RobotDescription] | None = None,
         block: BlockCfg | None = None,
         max_sweeps: int = MAX_SWEEPS,
         tolerance: float = TOLERANCE,
@@ -259,14 +260,14 @@ class JumperDynamics:
         `max_sweeps` below 1, or `tolerance` not finite and positive.
         """
         check_model(model)
-        check_type("description", description, RobotDescription | None)
+        robots = described_robots(description)
         check_type("block", block, BlockCfg | None)
         max_sweeps = check_count("max_sweeps", max_sweeps)
         check_positive("tolerance", tolerance)
         self.model = model
         self.max_sweeps = max_sweeps
         self.tolerance = tolerance
-        self.description = load_description() if description is None else description
+        self.description = robots[0]
         self.modules = kernel_modules(double)
         self.real: type = self.modules.scalar.real
         self.device = model.device
@@ -275,13 +276,14 @@ class JumperDynamics:
         self.ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
-        self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
+        springs = np.array([robots[world % len(robots)].spring for world in range(self.num_worlds)], dtype=np.float32)
+        self.leg_springs = wp.array(springs, dtype=wp.vec2, device=self.device)
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between knees, vec2 of shape (num_worlds,).
 
         Call `pack_springs` after a change."""
 
         self.robot = self.modules.step.RobotModel()
-        self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
+        self.robot.geometry = leg_geometry_array(robots, self.modules.geometry, self.device)
         shape = (self.modules.layout.PARAMETER_ROWS, self.num_worlds)
         self.robot.table = wp.zeros(shape, dtype=self.real, device=self.device)
         self.robot.ground = ground_struct(model, self.ground_shape, self.modules.ground)

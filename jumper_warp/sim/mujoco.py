@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import newton
 import warp as wp
@@ -13,8 +14,9 @@ from jumper_warp.kernels.actuation.passive import passive_torque_kernel
 from jumper_warp.kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
 from jumper_warp.kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
+from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
 from jumper_warp.robot.model import KNEE_DOFS, LOOP_IMPEDANCE, PAWS, PHYSICS_DT, other_colliders
-from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange
+from jumper_warp.sim.dynamics import LINKS, TOLERANCE, JumperDynamics, WorldRange
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.newton_types import Control, Model, State
@@ -97,19 +99,23 @@ class MujocoDynamics(JumperDynamics):
         dt: float = PHYSICS_DT,
         tolerance: float = TOLERANCE,
         observe_forces: bool = True,
+        description: RobotDescription | Sequence[RobotDescription] | None = None,
     ) -> None:
         """Create Newton's MuJoCo solver; state: the one that it advances; control: gets the torques; dt: step [s].
 
         tolerance: checked only. observe_forces: see `Simulation`. Raises as `JumperDynamics` and `mujoco_solver`.
         """
-        super().__init__(model, tolerance=tolerance)
+        super().__init__(model, tolerance=tolerance, description=description)
         self._state = state
         self._control = control
         knee_damping = take_knee_damping(model)
         self.solver = mujoco_solver(model, dt=dt)
         robot = self.description
-        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP,
-                         self.robot.geometry, self.leg_springs]  # fmt: skip
+        legs = [sum(one.link(f"FL_{link}").mass for link in LINKS) * leg_dimensions(one, "FL").thigh ** 2
+                for one in (robot, load_description())]  # fmt: skip
+        stop = (value * legs[0] / legs[1] for value in EXPLICIT_STOP)  # stable with the inertia of other legs
+        self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *stop, self.robot.geometry,
+                         self.leg_springs]  # fmt: skip
         self._arrived = wp.zeros((12, self.num_worlds), dtype=float, device=self.device)
         self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # the last entry is no world's
         self._sensor = self._contacts = self._observables = None

@@ -15,6 +15,7 @@ from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
 from jumper_warp.kernels.dynamics.restore import restore_motors_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
+from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
@@ -118,8 +119,9 @@ class Simulation(Uncopied):
         observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
         visuals: Whether to add shapes that only viewers see.
         extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
-        robot: Overlay, or values of one robot (N = 1) or of every world (N = num_worlds), that replace the
-            description's. Their latency is not applied.
+        robot: A robot (`load_overlay`), several that the worlds take in turn, or values of one robot (N = 1) or of
+            every world (N = num_worlds) that replace those of `description`. Their latency is not applied.
+        description: Robot that `robot` has the values of; by default the overlay's, or the Jumper.
         threads: Number of CPU threads, which does not change results; by default that of
             `jumper_warp.utils.threads.set_threads`, or all cores. SolverMuJoCo and few worlds use one.
 
@@ -148,7 +150,8 @@ class Simulation(Uncopied):
         observe_forces: bool = True,
         visuals: bool = True,
         extras: Extras | None = None,
-        robot: RobotOverlay | RobotValues | None = None,
+        robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues | None = None,
+        description: RobotDescription | None = None,
         device: wp.DeviceLike = None,
         threads: int | None = None,
     ):
@@ -157,14 +160,14 @@ class Simulation(Uncopied):
         check_flags(keep_momentum=keep_momentum, observe_forces=observe_forces, visuals=visuals)
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
-        check_type("robot (see load_overlay)", robot, RobotOverlay | RobotValues | None)
         num_worlds = check_count("num_worlds", num_worlds)
         substeps = check_step(dt, substeps)
         threads = checked_threads(threads)
-        self.robot = values = _values_of(robot, friction)
+        self.robot = values = _values_of(robot, friction, num_worlds)
+        self.descriptions = _descriptions_of(robot) if description is None else [description]
         self.model = build_model(
-            num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
-            device=device, mujoco=solver == "mujoco", robot=values,
+            num_worlds, description=self.descriptions, ground=ground, friction=friction, gravity=gravity,
+            visuals=visuals, extras=extras, device=device, mujoco=solver == "mujoco", robot=values,
         )  # fmt: skip
         self.device = self.model.device
         self.num_worlds = num_worlds
@@ -177,12 +180,15 @@ class Simulation(Uncopied):
         self._filter = None if command_filter is None else filter_params(command_filter)
         self._make_arrays()
         if solver == "jumper":
-            self.dynamics = JumperDynamics(self.model, block=block, tolerance=tolerance, keep_momentum=keep_momentum)
+            self.dynamics = JumperDynamics(
+                self.model, block=block, tolerance=tolerance, keep_momentum=keep_momentum, description=self.descriptions
+            )
             warn_of_colliders(self.model)
         else:
             self.dynamics = MujocoDynamics(
-                self.model, self.state, self.control, dt=dt, tolerance=tolerance, observe_forces=observe_forces
-            )
+                self.model, self.state, self.control, dt=dt, tolerance=tolerance, observe_forces=observe_forces,
+                description=self.descriptions,
+            )  # fmt: skip
         if values is not None:
             self.dynamics.set_springs(values.spring_stiffness, values.spring_length)
         shared = self.dynamics.sliced and not self.device.is_cuda
@@ -423,14 +429,34 @@ class Simulation(Uncopied):
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
 
 
-def _values_of(robot: RobotOverlay | RobotValues | None, friction: float) -> RobotValues | None:
-    """Return a robot's values; the paws of an overlay without `paw_friction` have the given friction coefficient."""
-    if not isinstance(robot, RobotOverlay):
+def _values_of(
+    robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues | None, friction: float, num_worlds: int
+) -> RobotValues | None:
+    """Return the robots' values; the paws of an overlay without `paw_friction` have the given friction coefficient.
+
+    Raises InputError: an argument of another type.
+    """
+    if robot is None or isinstance(robot, RobotValues):
         return robot
-    values = robot.robots()
-    if "paw_friction" not in robot.values:
-        values.paw_friction[:] = friction
-    return values
+    robots = [robot] if isinstance(robot, RobotOverlay) else list(robot)
+    each = []
+    for one in robots:
+        check_type("robot (see load_overlay)", one, RobotOverlay)
+        values = one.robots()
+        if "paw_friction" not in one.values:
+            values.paw_friction[:] = friction
+        each.append(values)
+    if len(each) == 1:
+        return each[0]
+    turns = np.arange(num_worlds) % len(each)
+    return RobotValues(**{name: np.vstack([getattr(one, name) for one in each])[turns] for name in vars(each[0])})
+
+
+def _descriptions_of(robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues | None) -> list[RobotDescription]:
+    """Return the descriptions of the robots that worlds take in turn."""
+    if robot is None or isinstance(robot, RobotValues):
+        return [load_description()]
+    return [one.description for one in ([robot] if isinstance(robot, RobotOverlay) else robot)]
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

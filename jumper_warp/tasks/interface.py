@@ -10,14 +10,15 @@ import dataclasses
 import math
 from typing import Any
 
-from jumper_warp.robot.description import MOTOR_JOINTS, load_description
+from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.motors import MotorKindCfg
 from jumper_warp.tasks.cfg import TaskCfg
 
 
-def interface(task: TaskCfg) -> dict[str, Any]:
+def interface(task: TaskCfg, robot: RobotDescription | None = None) -> dict[str, Any]:
     """Describe inputs and outputs of a task's policies as JSON data; lists of 12 are in the order of `joint_names`.
 
+    robot: by default the Jumper.
     Units: action_scale, default_joint_pos [rad]; joint_stiffness [N m/rad]; joint_damping [N m s/rad]; torque_limit
     [N m]; command_filter [deg], [deg/s] and [s]. observation_layout: half-open column range by term.
     """
@@ -41,7 +42,7 @@ def interface(task: TaskCfg) -> dict[str, Any]:
         },
         "joint_names": list(MOTOR_JOINTS),
         "action_scale": per_motor(*map(math.radians, task.action_scale)),
-        "default_joint_pos": [float(angle) for angle in load_description().pose("default")],
+        "default_joint_pos": [float(angle) for angle in (robot or load_description()).pose("default")],
         "joint_stiffness": per_motor(motors.lateral.kp, motors.transversal.kp),
         "joint_damping": per_motor(motors.lateral.kd, motors.transversal.kd),
         "torque_limit": per_motor(torque(motors.lateral), torque(motors.transversal)),

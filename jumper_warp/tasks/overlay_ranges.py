@@ -49,7 +49,7 @@ def moves_of(overlay: RobotOverlay | None) -> RangeMoves:
     """Return the offsets by which an overlay shifts randomisation ranges; 0 where it has no value, or its own range."""
     if overlay is None:
         return RangeMoves()
-    described = vars(RobotValues.nominal(1))
+    described = vars(RobotValues.nominal(1, overlay.description))
     own = overlay.randomization
     moves = {}
     for name, quantity in MOVED.items():

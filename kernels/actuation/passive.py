@@ -8,7 +8,7 @@ forces before each step. `SolverJumper` includes them, damping and stops implici
 import warp as wp
 
 from ..kinematics.five_bar import five_bar
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..layout import COORDS, DOFS
 from ..scalar import real
 from .joint_forces import capped_damping
@@ -71,7 +71,7 @@ def passive_torque_kernel(
         spring.stiffness = real(springs[world][0])
         spring.length = real(springs[world][1])
         pull = spring_torque(
-            spring, five_bar(geometry[leg], joint_q[q + 1], joint_q[q + 3])
+            spring, five_bar(leg_of(geometry, world, leg), joint_q[q + 1], joint_q[q + 3])
         )  # lateral, outer, inner [N m]
         joint_f[d + 1] = joint_f[d + 1] + pull[1]
         joint_f[d + 3] = joint_f[d + 3] + pull[2]

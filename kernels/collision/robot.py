@@ -15,7 +15,7 @@ or its neighbour first).
 import warp as wp
 
 from ..kinematics.five_bar import five_bar
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..scalar import mat33, mat43, quat, real, vec3, vec4
 from ..terrain.ground import Ground, ground_distance, world_ground
 from .distances import inflated_distance, segment_box_bound_sq, segment_box_sq, segment_segment_sq
@@ -31,17 +31,14 @@ LEG_LEG = wp.constant(32)
 LEG_SELF = wp.constant(64)
 LEG_SHELL = wp.constant(128)
 
-HOUSING_LENGTH = wp.constant(real(0.19))  # [m] from the hip outward along the lateral axis
-HOUSING_RADIUS = wp.constant(real(0.048))  # [m]
-THIGH_RADIUS = wp.constant(real(0.019))  # [m], knees too
-SHANK_RADIUS = wp.constant(real(0.012))  # [m]
 SHANK_FREE = wp.constant(real(0.9))  # fraction of a shank, from the knee, that must not touch the ground
 SHANK_APART = wp.constant(real(0.5))  # fraction of a shank, from the knee, that must not touch the other shank
 FAR = wp.constant(real(1.0e6))  # [m] start value of a minimum of distances
 
 mat53 = wp.types.matrix(shape=(5, 3), dtype=real)
 
-# shell boxes in the body frame [m], one a row: nose to tail, trunk, front motor drums, rear motor drums
+# boxes of a shell of factor 1 (`LegGeometry.shell`) in the body frame [m], one a row:
+# nose to tail, trunk, front motor drums, rear motor drums
 SHELL_BOXES = wp.constant(4)
 LOWER_CORNERS = wp.constant(4 * SHELL_BOXES)
 SHELL_CENTER = wp.constant(mat43(0.0, 0.0, 0.025, 0.0, 0.0, 0.025, 0.1125, 0.0, 0.0, -0.112, 0.0, 0.0))
@@ -52,14 +49,13 @@ SHELL_HALF = wp.constant(mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 
 class LegCapsules:
     """Capsules that model the links of one leg, in the body frame."""
 
-    ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, ankle
+    ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, paw
     low: vec3  # [m] smallest x, y and z of the ends
     high: vec3  # [m] largest x, y and z of the ends
     hip: vec3  # [m] see `LegGeometry`
     normal: vec3  # unit normal of the leg's plane
-    offset: real  # [m] of the knees and the ankle along the normal, from the hip
-    front: real  # +1 front leg, -1 back leg
-    paw_radius: real  # [m]
+    offset: real  # [m] of the knees and the paw along the normal, from the hip
+    geometry: LegGeometry
 
 
 @wp.struct
@@ -85,14 +81,13 @@ def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> L
     inner_axis = root + geo.inner_x * forward
     outer_knee = plane + loop.outer_knee[0] * forward + loop.outer_knee[1] * up
     inner_knee = plane + loop.inner_knee[0] * forward + loop.inner_knee[1] * up
-    ankle = plane + loop.ankle[0] * forward + loop.ankle[1] * up
-    capsules.ends = wp.matrix_from_rows(outer_axis, inner_axis, outer_knee, inner_knee, ankle)
-    capsules.low = wp.min(wp.min(wp.min(outer_axis, inner_axis), wp.min(outer_knee, inner_knee)), ankle)
-    capsules.high = wp.max(wp.max(wp.max(outer_axis, inner_axis), wp.max(outer_knee, inner_knee)), ankle)
+    paw = plane + loop.paw[0] * forward + loop.paw[1] * up
+    capsules.ends = wp.matrix_from_rows(outer_axis, inner_axis, outer_knee, inner_knee, paw)
+    capsules.low = wp.min(wp.min(wp.min(outer_axis, inner_axis), wp.min(outer_knee, inner_knee)), paw)
+    capsules.high = wp.max(wp.max(wp.max(outer_axis, inner_axis), wp.max(outer_knee, inner_knee)), paw)
     capsules.hip = geo.hip
     capsules.normal = normal
-    capsules.front = geo.front
-    capsules.paw_radius = geo.paw_radius
+    capsules.geometry = geo
     return capsules
 
 
@@ -100,8 +95,8 @@ def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> L
 def capsule_end(k: int) -> int:
     """Return the row of `LegCapsules.ends` that holds the far end of link k; the near end is in row k.
 
-    Thighs (0, 1) end in the knees (rows 2, 3), shanks (2, 3) in the ankle (row 4), and the paw (4) begins and ends
-    there.
+    Thighs (0, 1) end in the knees (rows 2, 3), shanks (2, 3) in the paw (row 4), as if the ankle were
+    there, and the paw (4) begins and ends there.
     """
     return wp.min(k + 2, 4)
 
@@ -109,7 +104,8 @@ def capsule_end(k: int) -> int:
 @wp.func
 def capsule_radius(capsules: LegCapsules, k: int) -> real:
     """Return the radius [m] of link k: thighs 0 and 1, shanks 2 and 3, paw 4."""
-    return wp.where(k < 2, THIGH_RADIUS, wp.where(k < 4, SHANK_RADIUS, capsules.paw_radius))
+    geo = capsules.geometry
+    return wp.where(k < 2, geo.thigh_radius, wp.where(k < 4, geo.shank_radius, geo.paw_radius))
 
 
 @wp.func
@@ -120,22 +116,25 @@ def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
     only their upper parts (`SHANK_APART`) count; those are nearest at their lower ends.
     """
     outer_axis, inner_axis = capsules.ends[0], capsules.ends[1]
-    outer_knee, inner_knee, ankle = capsules.ends[2], capsules.ends[3], capsules.ends[4]
+    outer_knee, inner_knee, paw = capsules.ends[2], capsules.ends[3], capsules.ends[4]
     thighs_sq = segment_segment_sq(outer_axis, outer_knee, inner_axis, inner_knee)
-    outer_thigh_sq = segment_segment_sq(outer_axis, outer_knee, inner_knee, ankle)
-    inner_thigh_sq = segment_segment_sq(inner_axis, inner_knee, outer_knee, ankle)
+    outer_thigh_sq = segment_segment_sq(outer_axis, outer_knee, inner_knee, paw)
+    inner_thigh_sq = segment_segment_sq(inner_axis, inner_knee, outer_knee, paw)
     span = SHANK_APART * (outer_knee - inner_knee)
-    thighs = inflated_distance(thighs_sq, real(2.0) * THIGH_RADIUS, bound)
-    crossed = inflated_distance(wp.min(outer_thigh_sq, inner_thigh_sq), THIGH_RADIUS + SHANK_RADIUS, bound)
-    shanks = inflated_distance(wp.dot(span, span), real(2.0) * SHANK_RADIUS, bound)
+    geo = capsules.geometry
+    thighs = inflated_distance(thighs_sq, real(2.0) * geo.thigh_radius, bound)
+    if geo.outer_x == geo.inner_x:
+        thighs = bound  # thighs about one axis lie in two planes
+    crossed = inflated_distance(wp.min(outer_thigh_sq, inner_thigh_sq), geo.thigh_radius + geo.shank_radius, bound)
+    shanks = inflated_distance(wp.dot(span, span), real(2.0) * geo.shank_radius, bound)
     return wp.min(thighs, wp.min(crossed, shanks))
 
 
 @wp.func
 def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
     """Return the distance [m] between a leg and box 0 to 3 of the shell (`SHELL_CENTER`), at most `bound` (>= 0)."""
-    center = SHELL_CENTER[box]
-    half = SHELL_HALF[box]
+    center = wp.cw_mul(SHELL_CENTER[box], capsules.geometry.shell)
+    half = wp.cw_mul(SHELL_HALF[box], capsules.geometry.shell)
     nearest = bound
     # The whole leg lies in one plane: if the plane is clear of the box, so is every link. (The thighs' upper ends lie
     # knee_y inside the plane, which their radius, smaller than the paw's, offsets.)
@@ -143,7 +142,7 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
         wp.abs(capsules.normal), half
     )
     bounding_sq = segment_box_bound_sq(capsules.low - center, capsules.high - center, half)
-    reach = bound + capsules.paw_radius
+    reach = bound + capsules.geometry.paw_radius
     if plane_gap < reach and bounding_sq < reach * reach:
         count = wp.int32(5)
         for k in range(count):
@@ -161,7 +160,7 @@ def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
 
     The leg turns around these drums at a fixed distance. Boxes: 0 nose to tail, 1 trunk, 2 front drums, 3 rear drums.
     """
-    drums = wp.where(capsules.front > real(0.0), 3, 2)
+    drums = wp.where(capsules.geometry.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))
 
@@ -173,7 +172,7 @@ def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> r
     The legs' bounding boxes are compared first; only if these are close, all 25 pairs of links are.
     """
     gap = wp.max(wp.max(neighbour.low - leg.high, leg.low - neighbour.high), vec3(real(0.0)))
-    reach = bound + leg.paw_radius + neighbour.paw_radius
+    reach = bound + leg.geometry.paw_radius + neighbour.geometry.paw_radius
     nearest = bound
     if wp.dot(gap, gap) < reach * reach:
         count = wp.int32(25)
@@ -189,8 +188,10 @@ def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> r
 
 
 @wp.func
-def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
+def body_ground_distance(ground: Ground, shell: vec3, pos: vec3, rotation: mat33) -> real:
     """Return the smallest signed distance [m] of the shell from the ground, along the ground's normal, negative inside.
+
+    shell [1]: see `LegGeometry`.
 
     Only the four lower corners of each shell box are tested: exact over a plane, but bumps of a heightfield between
     the corners (at most 0.2 m apart along x) are missed. pos: base position [m], world; rotation: body to world.
@@ -199,10 +200,10 @@ def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
     nearest = real(FAR)
     count = wp.int32(LOWER_CORNERS)
     for i in range(count):
-        half = SHELL_HALF[i // 4]
+        half = wp.cw_mul(SHELL_HALF[i // 4], shell)
         x = wp.where(i % 2 == 0, half[0], -half[0])
         y = wp.where((i // 2) % 2 == 0, half[1], -half[1])
-        corner = SHELL_CENTER[i // 4] + vec3(x, y, lower * half[2])
+        corner = wp.cw_mul(SHELL_CENTER[i // 4], shell) + vec3(x, y, lower * half[2])
         nearest = wp.min(nearest, ground_distance(ground, pos + rotation * corner))
     return nearest
 
@@ -215,8 +216,9 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
     Exact over a plane; over a heightfield links are tested every 0.09 m. pos: base position [m], world; rotation: body
     to world.
     """
+    geo = capsules.geometry
     housing = ground_distance(ground, pos + rotation * capsules.hip)
-    tip = capsules.hip + vec3(capsules.front * HOUSING_LENGTH, real(0.0), real(0.0))
+    tip = capsules.hip + vec3(geo.front * geo.housing_length, real(0.0), real(0.0))
     housing = wp.min(housing, ground_distance(ground, pos + rotation * tip))
     thigh = real(FAR)
     knee = real(FAR)
@@ -232,7 +234,9 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
             fraction = SHANK_FREE * real(i + 1) / real(3.0)
             shank = wp.min(shank, ground_distance(ground, knee_world + fraction * (ankle_world - knee_world)))
     shank = wp.min(shank, knee)
-    return vec4(housing - HOUSING_RADIUS, thigh - THIGH_RADIUS, knee - THIGH_RADIUS, shank - SHANK_RADIUS)
+    return vec4(
+        housing - geo.housing_radius, thigh - geo.thigh_radius, knee - geo.thigh_radius, shank - geo.shank_radius
+    )
 
 
 @wp.func
@@ -246,11 +250,13 @@ def add_distance(collisions: Collisions, distance: real, least: real, flag: int)
 
 @wp.func
 def load_leg(
-    geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), start: int, leg: int
+    geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), world: int, start: int, leg: int
 ) -> LegCapsules:
     """Return the capsules that model leg 0 to 3 of a world, whose coordinates begin at index `start` of joint_q."""
     motor = start + 7 + 5 * leg
-    return leg_capsules(geometry[leg], real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3]))
+    return leg_capsules(
+        leg_of(geometry, world, leg), real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3])
+    )
 
 
 @wp.func
@@ -286,11 +292,12 @@ def add_leg_distances(
 
 @wp.func
 def world_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, margin: real
-) -> Collisions:
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, start: int,
+    margin: real,
+) -> Collisions:  # fmt: skip
     """Return the forbidden contacts of one robot and the smallest distance [m] of all checked pairs, at most `margin`.
 
-    geometry: the four legs. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
+    geometry: see `leg_of`. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
     quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are
     clamped to it, which is fast; with 0 only the flags are meaningful. Flags of a non-finite state are undefined.
     """
@@ -300,11 +307,16 @@ def world_collisions(
     )
     collisions = Collisions()
     collisions.clearance = margin
-    collisions = add_distance(collisions, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
-    leg = load_leg(geometry, joint_q, start, 0)
+    collisions = add_distance(
+        collisions,
+        body_ground_distance(ground, leg_of(geometry, world, 0).shell, pos, rotation),
+        real(0.0),
+        BODY_GROUND,
+    )
+    leg = load_leg(geometry, joint_q, world, start, 0)
     count = wp.int32(4)
     for order in range(count):
-        neighbour = load_leg(geometry, joint_q, start, next_leg(order + 1))
+        neighbour = load_leg(geometry, joint_q, world, start, next_leg(order + 1))
         collisions = add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, real(0.0))
         leg = neighbour
     return collisions
@@ -312,8 +324,8 @@ def world_collisions(
 
 @wp.func
 def leg_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, order: int,
-    min_distance: real,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, start: int,
+    order: int, min_distance: real,
 ) -> int:  # fmt: skip
     """Return the flags of the forbidden contacts of one leg, at position `order` (0 to 3) around the body.
 
@@ -327,9 +339,14 @@ def leg_collisions(
     )
     collisions = Collisions()
     if order == 0:
-        collisions = add_distance(collisions, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
-    leg = load_leg(geometry, joint_q, start, next_leg(order))
-    neighbour = load_leg(geometry, joint_q, start, next_leg(order + 1))
+        collisions = add_distance(
+            collisions,
+            body_ground_distance(ground, leg_of(geometry, world, 0).shell, pos, rotation),
+            real(0.0),
+            BODY_GROUND,
+        )
+    leg = load_leg(geometry, joint_q, world, start, next_leg(order))
+    neighbour = load_leg(geometry, joint_q, world, start, next_leg(order + 1))
     return add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, min_distance).flags
 
 
@@ -351,6 +368,6 @@ def collision_kernel(
     """
     world = wp.tid()
     here = world_ground(ground, world)
-    collisions = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)
+    collisions = world_collisions(geometry, here, joint_q, world, world * coords_per_world, margin)
     flags[world] = collisions.flags
     clearance[world] = wp.float32(collisions.clearance)

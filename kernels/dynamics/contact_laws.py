@@ -7,6 +7,7 @@ Vectors are in body axes; normals n point out of the ground, impulses act on the
 
 import warp as wp
 
+from ..kinematics.geometry import leg_of
 from ..scalar import mat33, real, vec3
 from ..state import BaseState
 from ..terrain.ground import floor_normal
@@ -34,8 +35,9 @@ class PawLaw:
 
 @wp.func
 def contact_at(
-    model: RobotModel, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
-) -> PawContact:
+    model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse,
+    impulse: vec3,
+) -> PawContact:  # fmt: skip
     """Return the contact of paw k with the floor at the solution of a step, with velocity responses to impulses.
 
     k: 0 to 3. impulse [N s]: body axes. Recomputed from the state at the start of the step, instead of stored.
@@ -45,15 +47,15 @@ def contact_at(
     contact.impulse = impulse
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
-    arm = -model.geometry[k].paw_radius * contact.normal
+    arm = -leg_of(model.geometry, world, k).paw_radius * contact.normal
     contact.jacobian = contact_jacobian(paw, arm)
     return couple_contact(contact, paw.position + arm, leg, inverse)
 
 
 @wp.func
-def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
+def contact_point(model: RobotModel, world: int, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
     """Return the contact point [m] of paw k (0 to 3) in the body frame."""
-    return paw.position - model.geometry[k].paw_radius * contact.normal
+    return paw.position - leg_of(model.geometry, world, k).paw_radius * contact.normal
 
 
 @wp.func

@@ -90,13 +90,13 @@ def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
     loop, cosine, sine = pose.loop, pose.cosine, pose.sine
     zero = real(0.0)
     y = geo.plane_y + geo.knee_y
-    x, z = loop.ankle[0], loop.ankle[1]
+    x, z = loop.paw[0], loop.paw[1]
     paw = PawKinematics()
     paw.position = geo.hip + rotate_x(vec3(x, y, z), cosine, sine)
     paw.jacobian = columns(
         geo.side * vec3(zero, -(sine * y + cosine * z), cosine * y - sine * z),
-        rotate_x_plane(loop.ankle_do, cosine, sine),
-        rotate_x_plane(loop.ankle_di, cosine, sine),
+        rotate_x_plane(loop.paw_do, cosine, sine),
+        rotate_x_plane(loop.paw_di, cosine, sine),
     )
     pitch = vec3(zero, cosine, sine)
     paw.spin = columns(vec3(geo.side, zero, zero), loop.inner_shank_do * pitch, loop.inner_shank_di * pitch)

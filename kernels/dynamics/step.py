@@ -11,7 +11,7 @@ import warp as wp
 from ..actuation.joint_forces import JointParams, joint_forces
 from ..actuation.springs import LegSpring, spring_torque
 from ..actuation.stops import StopRates
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
 from ..state import BaseState, base_com
@@ -38,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 class RobotModel:
     """Parameters of the robots and their ground in every world; constant during a launch but for sliding blocks."""
 
-    geometry: wp.array(dtype=LegGeometry)  # (4,): FL, FR, BL, BR, the same in all worlds
+    geometry: wp.array(dtype=LegGeometry)  # (4 robots,), see `leg_of`
     table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
     ground: Ground
     held: wp.array(dtype=int)  # (num_worlds,), not 0: the base keeps its twist (suspended); empty: none held
@@ -77,7 +77,7 @@ class LegTerms:
 def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
     """Return the geometry, masses and joint constants of leg k of a world."""
     params = LegParams()
-    params.geometry = model.geometry[k]
+    params.geometry = leg_of(model.geometry, world, k)
     params.masses = load_masses(model.table, k, world)
     params.joints = load_joint_params(model.table, k, world)
     return params
@@ -136,11 +136,11 @@ def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> Block
 
 
 @wp.func
-def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) -> Touch:
+def touch_floor(model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics) -> Touch:
     """Return gap and normal of the point of the floor that is nearest to paw k; the floor is at rest."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     touch = Touch()
-    touch.gap = floor_distance(model.ground, centre) - model.geometry[k].paw_radius
+    touch.gap = floor_distance(model.ground, centre) - leg_of(model.geometry, world, k).paw_radius
     touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
     return touch
 
@@ -151,7 +151,7 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     block = model.ground.blocks[world]
     touch = Touch()
-    touch.gap = block_distance(block, centre) - model.geometry[k].paw_radius
+    touch.gap = block_distance(block, centre) - leg_of(model.geometry, world, k).paw_radius
     touch.normal = wp.quat_rotate_inv(base.quat, block_normal(block, centre))
     touch.velocity = law.velocity
     return touch
@@ -182,7 +182,7 @@ def paw_contact(
     the leg's pressed stops.
     """
     contact = PawContact()
-    touch = touch_floor(model, k, base, paw)
+    touch = touch_floor(model, world, k, base, paw)
     on_block = bool(False)
     if has_block(model.ground, world):
         above = touch_block(model, world, k, base, paw, block)
@@ -191,7 +191,7 @@ def paw_contact(
             on_block = True
     gap = touch.gap
     normal = touch.normal
-    arm = -model.geometry[k].paw_radius * normal
+    arm = -leg_of(model.geometry, world, k).paw_radius * normal
     point = paw.position + arm
     contact.jacobian = contact_jacobian(paw, arm)
     contact.normal = normal

@@ -5,18 +5,8 @@ The ground is level, at height 0. Weights depend on the row, as of a term that c
 
 import warp as wp
 
-from ..collision.robot import (
-    HOUSING_LENGTH,
-    HOUSING_RADIUS,
-    SHANK_FREE,
-    SHANK_RADIUS,
-    THIGH_RADIUS,
-    LegCapsules,
-    leg_capsules,
-    leg_leg_distance,
-    leg_shell_distance,
-)
-from ..kinematics.geometry import LegGeometry
+from ..collision.robot import SHANK_FREE, LegCapsules, leg_capsules, leg_leg_distance, leg_shell_distance
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..scalar import quat, real, vec3
 
 HEIGHT = wp.constant(0)  # rows of the weights: squared error of the base's height [m^2]
@@ -43,14 +33,16 @@ def leg_lacking_sq(geo: LegGeometry, leg: LegCapsules, z: real, up: vec3) -> rea
 
     z: height of the base [m]; up: world z in body axes.
     """
-    tip = geo.hip + vec3(geo.front * HOUSING_LENGTH, real(0.0), real(0.0))
-    total = lacking_sq(z + wp.dot(up, geo.hip), HOUSING_RADIUS) + lacking_sq(z + wp.dot(up, tip), HOUSING_RADIUS)
+    tip = geo.hip + vec3(geo.front * geo.housing_length, real(0.0), real(0.0))
+    total = lacking_sq(z + wp.dot(up, geo.hip), geo.housing_radius) + lacking_sq(
+        z + wp.dot(up, tip), geo.housing_radius
+    )
     ankle = z + wp.dot(up, leg.ends[4])
     outer = z + wp.dot(up, leg.ends[2])
     inner = z + wp.dot(up, leg.ends[3])
-    total = total + lacking_sq(outer, THIGH_RADIUS) + lacking_sq(inner, THIGH_RADIUS)
-    total = total + lacking_sq(outer + SHANK_FREE * (ankle - outer), SHANK_RADIUS)
-    return total + lacking_sq(inner + SHANK_FREE * (ankle - inner), SHANK_RADIUS)
+    total = total + lacking_sq(outer, geo.thigh_radius) + lacking_sq(inner, geo.thigh_radius)
+    total = total + lacking_sq(outer + SHANK_FREE * (ankle - outer), geo.shank_radius)
+    return total + lacking_sq(inner + SHANK_FREE * (ankle - inner), geo.shank_radius)
 
 
 @wp.func
@@ -82,15 +74,16 @@ def plan_cost_kernel(
     z = q[row, 2, world]
     motor = 3 * leg
     angles = motor_angles(q, row, world, leg)
-    capsules = leg_capsules(geometry[leg], angles[0], angles[1], angles[2])
+    geo = leg_of(geometry, world, leg)
+    capsules = leg_capsules(geo, angles[0], angles[1], angles[2])
     neighbour = (leg + 2) % 4  # the other leg of its side
     beside = motor_angles(q, row, world, neighbour)
-    others = leg_capsules(geometry[neighbour], beside[0], beside[1], beside[2])
+    others = leg_capsules(leg_of(geometry, world, neighbour), beside[0], beside[1], beside[2])
     off = angles - vec3(pose[motor, world], pose[motor + 1, world], pose[motor + 2, world])
     total = weight[row, POSE, world] * wp.dot(off, off)
     # every leg has the corner of the shell at its own end and side
-    corner = vec3(geometry[leg].front * SHELL[0], geometry[leg].side * SHELL[1], SHELL[2])
-    lacking = leg_lacking_sq(geometry[leg], capsules, z, up) + lacking_sq(z + wp.dot(up, corner), real(0.0))
+    corner = vec3(geo.front * SHELL[0] * geo.shell[0], geo.side * SHELL[1] * geo.shell[1], SHELL[2] * geo.shell[2])
+    lacking = leg_lacking_sq(geo, capsules, z, up) + lacking_sq(z + wp.dot(up, corner), real(0.0))
     apart = MARGIN - leg_shell_distance(capsules, MARGIN)
     between = MARGIN - leg_leg_distance(capsules, others, MARGIN)
     total = total + weight[row, GAP, world] * (lacking + apart * apart + real(0.5) * between * between)

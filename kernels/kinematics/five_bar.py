@@ -26,12 +26,15 @@ class FiveBar:
     outer_knee: vec2  # [m]
     inner_knee: vec2  # [m]
     ankle: vec2  # [m]
+    paw: vec2  # [m] centre of the paw
     outer_shank: vec2  # unit vector, outer knee to ankle
     inner_shank: vec2  # unit vector, inner knee to ankle
     outer_knee_do: vec2  # [m/rad] d outer_knee / d outer angle
     inner_knee_di: vec2  # [m/rad] d inner_knee / d inner angle
     ankle_do: vec2  # [m/rad] d ankle / d outer angle
     ankle_di: vec2  # [m/rad] d ankle / d inner angle
+    paw_do: vec2  # [m/rad] d paw / d outer angle
+    paw_di: vec2  # [m/rad] d paw / d inner angle
     outer_shank_do: real  # [1] d (rotation of the outer shank) / d outer angle
     outer_shank_di: real  # [1] d (rotation of the outer shank) / d inner angle
     inner_shank_do: real  # [1] d (rotation of the inner shank) / d outer angle
@@ -91,9 +94,13 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
 
     span = outer_knee - inner_knee
     span_sq = wp.max(wp.dot(span, span), real(1.0e-8))
-    height_sq = wp.max(geo.shank * geo.shank - real(0.25) * span_sq, real(1.0e-8))
-    ankle = real(0.5) * (outer_knee + inner_knee) + f * wp.sqrt(height_sq / span_sq) * vec2(span[1], -span[0])
-    outer_shank = (ankle - outer_knee) / geo.shank
+    # of the ankle from the middle between the knees toward the outer one, in units of their distance
+    skew = real(0.5) * (geo.shank - geo.outer_shank) * (geo.shank + geo.outer_shank) / span_sq
+    below_sq = geo.shank * geo.shank - real(0.25) * span_sq - skew * (real(1.0) + skew) * span_sq
+    height_sq = wp.max(below_sq, real(1.0e-8))
+    middle = real(0.5) * (outer_knee + inner_knee) + skew * span
+    ankle = middle + f * wp.sqrt(height_sq / span_sq) * vec2(span[1], -span[0])
+    outer_shank = (ankle - outer_knee) / geo.outer_shank
     inner_shank = (ankle - inner_knee) / geo.shank
     ankle_do = solve_projections(outer_shank, inner_shank, wp.dot(outer_shank, outer_knee_do), real(0.0))
     ankle_di = solve_projections(outer_shank, inner_shank, real(0.0), wp.dot(inner_shank, inner_knee_di))
@@ -109,10 +116,15 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     loop.inner_knee_di = inner_knee_di
     loop.ankle_do = ankle_do
     loop.ankle_di = ankle_di
-    loop.outer_shank_do = rotation_rate(outer_shank, ankle_do - outer_knee_do, geo.shank)
-    loop.outer_shank_di = rotation_rate(outer_shank, ankle_di, geo.shank)
+    loop.outer_shank_do = rotation_rate(outer_shank, ankle_do - outer_knee_do, geo.outer_shank)
+    loop.outer_shank_di = rotation_rate(outer_shank, ankle_di, geo.outer_shank)
     loop.inner_shank_do = rotation_rate(inner_shank, ankle_do, geo.shank)
     loop.inner_shank_di = rotation_rate(inner_shank, ankle_di - inner_knee_di, geo.shank)
+    # the paw lies on the inner shank, or beyond its ankle
+    turn = geo.paw_offset * vec2(inner_shank[1], -inner_shank[0])
+    loop.paw = ankle + geo.paw_offset * inner_shank
+    loop.paw_do = ankle_do + loop.inner_shank_do * turn
+    loop.paw_di = ankle_di + loop.inner_shank_di * turn
     return loop
 
 
@@ -136,7 +148,7 @@ def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate:
     ankle_acc = solve_projections(
         loop.outer_shank,
         loop.inner_shank,
-        wp.dot(loop.outer_shank, outer_knee_acc) - wp.dot(outer_rel, outer_rel) / geo.shank,
+        wp.dot(loop.outer_shank, outer_knee_acc) - wp.dot(outer_rel, outer_rel) / geo.outer_shank,
         wp.dot(loop.inner_shank, inner_knee_acc) - wp.dot(inner_rel, inner_rel) / geo.shank,
     )
     bias.outer_thigh_rate = -f * outer_rate
@@ -146,7 +158,7 @@ def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate:
     bias.outer_knee_acc = outer_knee_acc
     bias.inner_knee_acc = inner_knee_acc
     bias.ankle_acc = ankle_acc
-    bias.outer_shank_acc = rotation_rate(loop.outer_shank, ankle_acc - outer_knee_acc, geo.shank)
+    bias.outer_shank_acc = rotation_rate(loop.outer_shank, ankle_acc - outer_knee_acc, geo.outer_shank)
     bias.inner_shank_acc = rotation_rate(loop.inner_shank, ankle_acc - inner_knee_acc, geo.shank)
     return bias
 

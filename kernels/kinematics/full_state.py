@@ -12,7 +12,7 @@ from ..layout import BODIES, LEG_BODIES
 from ..scalar import quat, real, vec2, vec3
 from ..state import BaseState, leg_coord, leg_dof, load_base, load_motors
 from .five_bar import FiveBarBias, five_bar, five_bar_bias, in_plane
-from .geometry import LegGeometry
+from .geometry import LegGeometry, leg_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -149,7 +149,7 @@ def full_state_kernel(
     world, k = wp.tid()
     world += first
     zero = real(0.0)
-    geo = geometry[k]
+    geo = leg_of(geometry, world, k)
     com = body_com[world * BODIES]
     base = load_base(joint_q, joint_qd, vec3(real(com[0]), real(com[1]), real(com[2])), world)
     coord = leg_coord(world, k)

@@ -21,5 +21,18 @@ class LegGeometry:
     plane_y: real  # [m] both transversal axes, housing y
     knee_y: real  # [m] offset of knees, ankle and paw from the thigh plane, along housing y
     thigh: real  # [m] transversal axis to knee
-    shank: real  # [m] knee to ankle
-    paw_radius: real  # [m] sphere centred at the ankle
+    shank: real  # [m] inner knee to ankle
+    paw_radius: real  # [m]
+    outer_shank: real  # [m] outer knee to ankle
+    paw_offset: real  # [m] ankle to centre of the paw, along the inner shank
+    thigh_radius: real  # [m] of the capsules that collisions are tested with; knees too
+    shank_radius: real  # [m]
+    housing_radius: real  # [m]
+    housing_length: real  # [m] from the hip outward along the lateral axis
+    shell: vec3  # [1] length, width and height of the body's shell as factors on the boxes of `collision.robot`
+
+
+@wp.func
+def leg_of(geometry: wp.array(dtype=LegGeometry), world: int, leg: int) -> LegGeometry:
+    """Return the geometry of a leg of a world; the array has four rows a robot, and worlds take robots in turn."""
+    return geometry[(4 * world + leg) % geometry.shape[0]]

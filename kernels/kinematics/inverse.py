@@ -19,8 +19,8 @@ import warp as wp
 
 from ..scalar import quat, real, vec2, vec3
 from .five_bar import five_bar
-from .geometry import LegGeometry
-from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, rotate_lateral
+from .geometry import LegGeometry, leg_of
+from .leg import knee_angles, leg_forward_kinematics, paw_in_housing, rotate_lateral
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,29 +86,32 @@ def nearest_lateral(geo: LegGeometry, limits: LegLimits, target: vec3, ankle_z: 
 
 
 @wp.func
-def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
-    """Return the motor angle [rad] at which a thigh's shank reaches the ankle, with its knee away from the other thigh.
+def thigh_angle(geo: LegGeometry, shank: real, away: real, z: real) -> real:
+    """Return the motor angle [rad] at which a thigh's shank reaches a point, with its knee away from the other thigh.
 
-    away [m]: ankle from the thigh's axis along x, positive away from the other thigh; z [m]: ankle in the housing
-    frame. Out of reach, the leg is stretched or folded toward the ankle (`wp.acos` clamps its argument).
+    shank [m]: knee to point. away [m]: point from the thigh's axis along x, positive away from the other thigh; z [m]:
+    of the point in the housing frame. Out of reach, the leg is stretched or folded toward the point (`wp.acos` clamps
+    its argument).
     """
     distance_sq = wp.max(away * away + z * z, real(1.0e-12))
-    cosine = (distance_sq + geo.thigh * geo.thigh - geo.shank * geo.shank) / (
-        real(2.0) * geo.thigh * wp.sqrt(distance_sq)
-    )
+    cosine = (distance_sq + geo.thigh * geo.thigh - shank * shank) / (real(2.0) * geo.thigh * wp.sqrt(distance_sq))
     return wp.atan2(away, -z) + wp.acos(cosine)
 
 
 @wp.func
 def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> vec3:
-    """Return closed-form motor angles [rad] for an ankle target [m], clamped to limits; if out of reach, a first guess.
+    """Return closed-form motor angles [rad] for a paw target [m], clamped to limits; if out of reach, a first guess.
 
     target: from the hip, body axes.
     """
     plane = geo.plane_y + geo.knee_y
     z = -wp.sqrt(wp.max(target[1] * target[1] + target[2] * target[2] - plane * plane, real(0.0)))
-    outer = thigh_angle(geo, geo.front * (target[0] - geo.outer_x), z)
-    inner = thigh_angle(geo, geo.front * (geo.inner_x - target[0]), z)
+    inner = thigh_angle(geo, geo.shank + geo.paw_offset, geo.front * (geo.inner_x - target[0]), z)
+    # the ankle is on the line from the paw to the inner knee
+    beyond = geo.paw_offset / (geo.shank + geo.paw_offset)
+    knee = vec2(geo.inner_x - geo.front * geo.thigh * wp.sin(inner), -geo.thigh * wp.cos(inner))
+    ankle_x = target[0] + beyond * (knee[0] - target[0])
+    outer = thigh_angle(geo, geo.outer_shank, geo.front * (ankle_x - geo.outer_x), z + beyond * (knee[1] - z))
     thighs = clamp_transversal(limits, outer, inner)
     return vec3(nearest_lateral(geo, limits, target, z), thighs[0], thighs[1])
 
@@ -116,7 +119,7 @@ def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> ve
 @wp.func
 def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec2) -> vec3:
     """Return the ankle position nearest to `target` for fixed thigh angles [rad]; both [m] from the hip, body axes."""
-    ankle = ankle_in_housing(geo, five_bar(geo, thighs[0], thighs[1]))
+    ankle = paw_in_housing(geo, five_bar(geo, thighs[0], thighs[1]))
     return rotate_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
 
 
@@ -208,7 +211,7 @@ def paws_kernel(
     leg, robot = wp.tid()
     m = 3 * leg
     paws[leg, robot] = leg_forward_kinematics(
-        geometry[leg], motors[m, robot], motors[m + 1, robot], motors[m + 2, robot]
+        leg_of(geometry, robot, leg), motors[m, robot], motors[m + 1, robot], motors[m + 2, robot]
     )
 
 
@@ -229,15 +232,15 @@ def inverse_kinematics_kernel(
 ):
     """Write the joint angles that put the paws at target positions; launch over (4, n) for n robots.
 
-    geometry: 4 legs. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): target centres of
-    the paws, in the body frame, or in the world frame if `paws_in_world` is 1 (the base is not read otherwise).
+    geometry: see `leg_of`. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): target centres
+    of the paws, in the body frame, or in the world frame if `paws_in_world` is 1 (the base is not read otherwise).
     motors (12, n), knees (8, n: outer, inner per leg) [rad]. reachable (4, n), residual [m] (4, n): see `LegPose`.
     """
     leg, robot = wp.tid()
     paw = paws[leg, robot]
     if paws_in_world == 1:
         paw = wp.quat_rotate_inv(base_quat[robot], paw - base_pos[robot])
-    pose = leg_inverse_kinematics(geometry[leg], limits, paw)
+    pose = leg_inverse_kinematics(leg_of(geometry, robot, leg), limits, paw)
     for joint in range(3):
         motors[3 * leg + joint, robot] = pose.motors[joint]
     knees[2 * leg, robot] = pose.knees[0]

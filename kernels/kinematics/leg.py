@@ -1,6 +1,6 @@
 """Forward kinematics of one leg, its Jacobian and inverse velocity kinematics.
 
-Motor angles and rates are ordered lateral, outer, inner. The ankle is the centre of the paw. A leg's housing turns
+Motor angles and rates are ordered lateral, outer, inner. A leg's housing turns
 about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward; a positive outer or inner
 angle moves a thigh away from the leg's other thigh. Body axes are x ahead, y left, z up; side: +1 left, -1 right;
 front: +1 front leg, -1 back leg. The five-bar loop is planar: points (x, z) of the housing, at constant y.
@@ -26,25 +26,25 @@ def rotate_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec
 
 
 @wp.func
-def ankle_in_housing(geo: LegGeometry, loop: FiveBar) -> vec3:
-    """Return the position [m] of the ankle in the housing frame, whose origin is the hip."""
-    return vec3(loop.ankle[0], geo.plane_y + geo.knee_y, loop.ankle[1])
+def paw_in_housing(geo: LegGeometry, loop: FiveBar) -> vec3:
+    """Return the position [m] of the paw's centre in the housing frame, whose origin is the hip."""
+    return vec3(loop.paw[0], geo.plane_y + geo.knee_y, loop.paw[1])
 
 
 @wp.func
 def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: real) -> vec3:
-    """Return the position [m] of the ankle in the body frame, for the motor angles [rad]."""
+    """Return the position [m] of the paw's centre in the body frame, for the motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
-    return geo.hip + rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
+    return geo.hip + rotate_lateral(geo, lateral, paw_in_housing(geo, loop))
 
 
 @wp.func
 def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
-    """Return the Jacobian of the ankle position (body axes) w.r.t. lateral, outer, inner [m/rad], 3x3; angles [rad]."""
+    """Return the Jacobian of the paw's centre (body axes) w.r.t. lateral, outer, inner [m/rad], 3x3; angles [rad]."""
     loop = five_bar(geo, outer, inner)
-    arm = rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
-    by_outer = rotate_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
-    by_inner = rotate_lateral(geo, lateral, vec3(loop.ankle_di[0], real(0.0), loop.ankle_di[1]))
+    arm = rotate_lateral(geo, lateral, paw_in_housing(geo, loop))
+    by_outer = rotate_lateral(geo, lateral, vec3(loop.paw_do[0], real(0.0), loop.paw_do[1]))
+    by_inner = rotate_lateral(geo, lateral, vec3(loop.paw_di[0], real(0.0), loop.paw_di[1]))
     return mat33(
         real(0.0), by_outer[0], by_inner[0],
         -geo.side * arm[2], by_outer[1], by_inner[1],
@@ -64,20 +64,22 @@ def damped_ratio(speed: real, lever: real) -> real:
 
 
 @wp.func
-def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec3:
-    """Return motor rates [rad/s] that move the ankle at `ankle_vel` [m/s] relative to the body, in the body frame.
+def leg_inverse_velocity(geo: LegGeometry, angles: vec3, paw_vel: vec3) -> vec3:
+    """Return motor rates [rad/s] that move the paw at `paw_vel` [m/s] relative to the body, in the body frame.
 
     The inverse of `leg_jacobian` at the motor angles [rad], exact within joint limits unless a thigh and its shank are
     within 3.3 degrees of one line; there the rates are damped, to at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
-    vel = rotate_lateral(geo, -angles[0], ankle_vel)
-    # only the lateral motor moves the ankle along housing y; within joint limits the ankle is 0.1 m below or more
-    lateral_rate = -geo.side * vel[1] / wp.min(loop.ankle[1], real(-0.01))
+    vel = rotate_lateral(geo, -angles[0], paw_vel)
+    # only the lateral motor moves the paw along housing y; within joint limits the paw is 0.1 m below or more
+    lateral_rate = -geo.side * vel[1] / wp.min(loop.paw[1], real(-0.01))
     in_plane = vec2(vel[0], vel[2] - geo.side * lateral_rate * (geo.plane_y + geo.knee_y))
-    # shanks are rigid: ankle and knee move equally fast along them
-    outer_rate = damped_ratio(wp.dot(loop.outer_shank, in_plane), wp.dot(loop.outer_shank, loop.outer_knee_do))
+    # shanks are rigid: ankle, paw and knee move equally fast along them
     inner_rate = damped_ratio(wp.dot(loop.inner_shank, in_plane), wp.dot(loop.inner_shank, loop.inner_knee_di))
+    beyond = geo.paw_offset / (geo.shank + geo.paw_offset)
+    ankle_vel = in_plane - beyond * (in_plane - inner_rate * loop.inner_knee_di)
+    outer_rate = damped_ratio(wp.dot(loop.outer_shank, ankle_vel), wp.dot(loop.outer_shank, loop.outer_knee_do))
     return vec3(lateral_rate, outer_rate, inner_rate)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from ..collision.robot import leg_collisions
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..lanes import all_of_attempt, from_leg_of_attempt, least_of_attempts, sync_lanes
 from ..layout import COORDS, DOFS
 from ..scalar import vec3
@@ -83,18 +83,19 @@ def pose_is_valid(
     The threads of an attempt exchange their legs. sample: last leg that this thread sampled; reachable: whether all
     legs of this thread are. joint_q (COORDS,) and joint_qd (DOFS,): coordinates of the attempt, completed here.
     """
+    legs = wp.int32(4)
     all_reachable = all_legs(rng, reachable)
     if rng.lanes == 1 and not all_reachable:
         return False  # several lanes must all reach the exchange below
     if rng.lanes > 1:
         gathered = LegSample()
-        for leg in range(geometry.shape[0]):
+        for leg in range(legs):
             gathered.angles = vec_from_leg(sample.angles, leg)
             gathered.rates = vec_from_leg(sample.rates, leg)
             store_leg(leg, gathered, joint_q, joint_qd)
     flags = int(0)
-    for leg in range(first_leg(rng), geometry.shape[0], leg_step(rng)):
-        flags = flags | leg_collisions(geometry, ground, joint_q, 0, leg, MIN_LINK_DISTANCE)
+    for leg in range(first_leg(rng), legs, leg_step(rng)):
+        flags = flags | leg_collisions(geometry, ground, joint_q, rng.world, 0, leg, MIN_LINK_DISTANCE)
     return all_legs(rng, all_reachable and flags == 0)
 
 
@@ -117,8 +118,9 @@ def write_sample_and_check(
         joint_q[3 + j] = base.quat[j]
     reachable = bool(True)
     sample = LegSample()
-    for leg in range(first_leg(rng), scene.geometry.shape[0], leg_step(rng)):
-        sample = sample_leg(start, base, scene.geometry[leg], rng, leg)
+    legs = wp.int32(4)
+    for leg in range(first_leg(rng), legs, leg_step(rng)):
+        sample = sample_leg(start, base, leg_of(scene.geometry, rng.world, leg), rng, leg)
         reachable = reachable and sample.reachable
         store_leg(leg, sample, joint_q, joint_qd)
     return pose_is_valid(scene.geometry, start.ground, rng, sample, reachable, joint_q, joint_qd)
@@ -126,13 +128,14 @@ def write_sample_and_check(
 
 @wp.func
 def write_first_valid(
-    geometry: wp.array(dtype=LegGeometry), rng: RngStream, accepted: int, attempt_q: wp.array(dtype=float),
-    attempt_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
+    rng: RngStream, accepted: int, attempt_q: wp.array(dtype=float), attempt_qd: wp.array(dtype=float),
+    joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
     """Copy the first valid attempt to the world's coordinates in `joint_q`, `joint_qd`; return whether there is one.
 
     accepted: valid attempt of this thread, `ATTEMPTS` if none; attempt_q (COORDS,), attempt_qd (DOFS,): its sample.
     """
+    legs = wp.int32(4)
     first = accepted
     if rng.lanes > 1:
         first = least_of_attempts(accepted)
@@ -141,7 +144,7 @@ def write_first_valid(
             joint_q[rng.world * COORDS + i] = attempt_q[i]
         for i in range(6):
             joint_qd[rng.world * DOFS + i] = attempt_qd[i]
-        for leg in range(geometry.shape[0]):
+        for leg in range(legs):
             store_motors(joint_q, leg_coord(rng.world, leg), load_motors(attempt_q, leg_coord(0, leg)))
             store_motors(joint_qd, leg_dof(rng.world, leg), load_motors(attempt_qd, leg_dof(0, leg)))
     sync_attempts(rng)
@@ -169,4 +172,4 @@ def sample_valid_state(
                 sample_base, sample_leg, start, arrays, scene, branch, attempt, attempt_q, attempt_qd
             ):
                 accepted = attempt
-    return write_first_valid(scene.geometry, rng, accepted, attempt_q, attempt_qd, arrays.joint_q, arrays.joint_qd)
+    return write_first_valid(rng, accepted, attempt_q, attempt_qd, arrays.joint_q, arrays.joint_qd)

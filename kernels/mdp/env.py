@@ -22,7 +22,7 @@ RING = wp.constant(8)
 class Scene:
     """Scene that all worlds share: leg geometry, ground and default pose."""
 
-    geometry: wp.array(dtype=LegGeometry)  # (4,)
+    geometry: wp.array(dtype=LegGeometry)  # (4 robots,), see `leg_of`
     ground: Ground
     reference_q: wp.array(dtype=float)  # [m], [1], [rad] joint_q of the default pose, all worlds
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..terrain.ground import Ground
 from .observe import store
 from .options import kernel_name
@@ -98,7 +98,7 @@ def paw_gradient_kernel(
 ):
     """Write position [m], velocity [m/s] and height above the ground [m] of every paw, (4, num_worlds)."""
     leg, world = wp.tid()
-    paw = paw_motion(arrays, geometry[leg], world, leg)
+    paw = paw_motion(arrays, leg_of(geometry, world, leg), world, leg)
     pos[leg, world] = paw.pos
     vel[leg, world] = paw.vel
-    height[leg, world] = paw_clearance(geometry[leg], ground, world, paw.pos)
+    height[leg, world] = paw_clearance(leg_of(geometry, world, leg), ground, world, paw.pos)

@@ -83,16 +83,18 @@ def contacts(robot: RobotView, state: Any) -> wp.vec4:
 def drawn_mass(robot: RobotParameters, world: int) -> wp.vec2:
     """Mass added to the base, and to all legs together [kg]."""
     first = world * 21
+    nominal = first % robot.nominal_mass.shape[0]
     legs = float(0.0)
     for body in range(1, 21):
-        legs += robot.body_mass[first + body] - robot.nominal_mass[body]
-    return wp.vec2(robot.body_mass[first] - robot.nominal_mass[0], legs)
+        legs += robot.body_mass[first + body] - robot.nominal_mass[nominal + body]
+    return wp.vec2(robot.body_mass[first] - robot.nominal_mass[nominal], legs)
 
 
 @wp.func
 def drawn_com(robot: RobotParameters, world: int) -> wp.vec3:
     """Shift of the base's centre of mass, body axes, in units of 0.03 m."""
-    return (robot.body_com[world * 21] - robot.nominal_com[0]) / 0.03
+    i = world * 21
+    return (robot.body_com[i] - robot.nominal_com[i % robot.nominal_com.shape[0]]) / 0.03
 
 
 @wp.func

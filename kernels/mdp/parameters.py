@@ -38,11 +38,11 @@ class RobotParameters:
     speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) no-load, cutoff speed over nominal values
     torque_ratio: wp.array2d(dtype=float)  # [1] (12, num_worlds) torque limit over nominal value
     physics_dt: float  # [s] physics step
-    nominal_mass: wp.array(dtype=float)  # [kg] (21,) of one world
-    nominal_com: wp.array(dtype=wp.vec3)  # [m] (21,) body axes
-    nominal_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] (21,) body axes
-    nominal_inv_inertia: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (21,) body axes
-    nominal_armature: wp.array(dtype=float)  # [kg m^2] (38,) of one world
+    nominal_mass: wp.array(dtype=float)  # [kg] (21 robots,), which worlds take in turn
+    nominal_com: wp.array(dtype=wp.vec3)  # [m] (21 robots,) body axes
+    nominal_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] (21 robots,) body axes
+    nominal_inv_inertia: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (21 robots,) body axes
+    nominal_armature: wp.array(dtype=float)  # [kg m^2] (38 robots,)
     nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12)
     nominal_kd: wp.array2d(dtype=float)  # [N m s/rad] (skills, 12)
     nominal_no_load: wp.array2d(dtype=float)  # [rad/s] (skills, 12) no-load speed
@@ -66,18 +66,20 @@ def moved_uniform(rng: RngStream, i: int, lower: float, upper: float, move: floa
 def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
     """Write mass and inertia of body `body` (0: base) of a world: nominal values times `scale`."""
     i = world * BODIES + body
-    mass = scale * robot.nominal_mass[body]
-    inertia = scale * robot.nominal_inertia[body]
+    nominal = i % robot.nominal_mass.shape[0]
+    mass = scale * robot.nominal_mass[nominal]
+    inertia = scale * robot.nominal_inertia[nominal]
     robot.body_mass[i] = mass
     robot.body_inv_mass[i] = 1.0 / mass
     robot.body_inertia[i] = inertia
-    robot.body_inv_inertia[i] = robot.nominal_inv_inertia[body] / scale
+    robot.body_inv_inertia[i] = robot.nominal_inv_inertia[nominal] / scale
 
 
 @wp.func
 def base_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Add a random mass from lower to upper [kg] to the base, and scale its inertia in proportion."""
-    write_mass(robot, rng.world, 0, 1.0 + uniform(rng, 0, lower, upper) / robot.nominal_mass[0])
+    nominal = rng.world * BODIES % robot.nominal_mass.shape[0]
+    write_mass(robot, rng.world, 0, 1.0 + uniform(rng, 0, lower, upper) / robot.nominal_mass[nominal])
 
 
 @wp.func
@@ -91,15 +93,17 @@ def link_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float
 def com_shift(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Shift the base's centre of mass along each body axis by a random distance from lower to upper [m]."""
     shift = wp.vec3(uniform(rng, 0, lower, upper), uniform(rng, 1, lower, upper), uniform(rng, 2, lower, upper))
-    robot.body_com[rng.world * BODIES] = robot.nominal_com[0] + shift
+    i = rng.world * BODIES
+    robot.body_com[i] = robot.nominal_com[i % robot.nominal_com.shape[0]] + shift
 
 
 @wp.func
 def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Scale each motor's armature by a random factor from lower to upper [1]."""
     for m in range(rng.lane, 12, rng.lanes):
-        dof = 6 + motor_slot(m)
-        robot.joint_armature[rng.world * DOFS + dof] = robot.nominal_armature[dof] * uniform(rng, m, lower, upper)
+        i = rng.world * DOFS + 6 + motor_slot(m)
+        nominal = robot.nominal_armature[i % robot.nominal_armature.shape[0]]
+        robot.joint_armature[i] = nominal * uniform(rng, m, lower, upper)
 
 
 @wp.func

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from ..actuation.command_filter import FilterParams
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
@@ -249,7 +249,7 @@ def clear_history_kernel(
         arrays.touchdown_speed[m, world] = 0.0
         arrays.paw_height[m, world] = 0.0
         arrays.collisions[m, world] = 0
-        update_paw_kinematics(arrays, geometry[m], world, m)
+        update_paw_kinematics(arrays, leg_of(geometry, world, m), world, m)
     if m == 0:
         arrays.diverged[world] = 0
         arrays.body_f[world * BODIES] = wp.spatial_vector()

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..collision.robot import leg_collisions
 from ..dynamics.leg_dynamics import leg_pose, paw_kinematics
-from ..kinematics.geometry import LegGeometry
+from ..kinematics.geometry import LegGeometry, leg_of
 from ..layout import COORDS
 from ..state import leg_coord, leg_dof, load_motors
 from ..terrain.ground import Ground, grown_block, surface, world_ground
@@ -93,9 +93,11 @@ def track_kernel(
     skill = skills[episode.skill[world]]
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
     update_contact_timers(arrays, world, leg, down)  # reads paw_vel of the previous policy step: call it first
-    update_paw_kinematics(arrays, geometry[leg], world, leg)
-    arrays.paw_height[leg, world] = paw_clearance(geometry[leg], ground, world, arrays.paw_pos[leg, world])
+    update_paw_kinematics(arrays, leg_of(geometry, world, leg), world, leg)
+    arrays.paw_height[leg, world] = paw_clearance(
+        leg_of(geometry, world, leg), ground, world, arrays.paw_pos[leg, world]
+    )
     grown_ground = grown_block(world_ground(ground, world), skill.obstacle_margin)
     arrays.collisions[leg, world] = leg_collisions(
-        geometry, grown_ground, arrays.joint_q, world * COORDS, leg, skill.self_collision_margin
+        geometry, grown_ground, arrays.joint_q, world, world * COORDS, leg, skill.self_collision_margin
     )

@@ -53,7 +53,7 @@ def still(tmp_path_factory):
         (
             ["fly"],
             "no command 'fly'; there are train, watch, finetune, play, drive, evaluate, compare, try, sweep, "
-            "rescore, export, deploy, bus-sim, sysid, list",
+            "rescore, export, deploy, bus-sim, sysid, robot, list",
         ),
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),

@@ -41,7 +41,10 @@ def test_load_overlay_inverts_save(tmp_path):
             {"values": {"kp": 12 * [20.0]}},
             r"kp must be in 0.05 to 3 times the described value \(1: as described\), got 20$",
         ),
-        ({"value": {"kp": 12 * [1.1]}}, "unknown section 'value'; expected one of schema, source, values, random"),
+        (
+            {"value": {"kp": 12 * [1.1]}},
+            "unknown section 'value'; expected one of schema, source, robot, values, random",
+        ),
         ({"values": {"cutoff_speed": 12 * [60.0]}}, "below the no_load_speed"),
     ],
 )

@@ -152,6 +152,8 @@ def test_leg_geometry_matches_joint_origins(description):
     assert front_left == {
         "hip": (0.1433, 0.105, 0.0), "front": 1.0, "side": 1.0, "outer_x": 0.1417, "inner_x": 0.0517,
         "plane_y": 0.05945, "knee_y": 0.00075, "thigh": 0.175, "shank": 0.3, "paw_radius": 0.025,
+        "outer_shank": 0.3, "paw_offset": 0.0, "thigh_radius": 0.019, "shank_radius": 0.012, "housing_radius": 0.048,
+        "housing_length": 0.19, "shell": (1.0, 1.0, 1.0),
     }  # fmt: skip
 
 

@@ -160,7 +160,7 @@ def add_stops(sums: Any, leg: int, p: StopParams):
 
 @wp.func
 def add_geometry(sums: Any, leg: int, geo: LegGeometry):
-    """Add the gradient w.r.t. a leg's hip position and lengths to a world's parameter gradient."""
+    """Add the gradient w.r.t. a leg's hip position and lengths, `shank` being both shanks, to a world's gradient."""
     row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
     add_vec3(sums, row, geo.hip)
     add_entry(sums, row + 3, geo.outer_x)
@@ -168,7 +168,7 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
     add_entry(sums, row + 5, geo.plane_y)
     add_entry(sums, row + 6, geo.knee_y)
     add_entry(sums, row + 7, geo.thigh)
-    add_entry(sums, row + 8, geo.shank)
+    add_entry(sums, row + 8, geo.shank + geo.outer_shank)
     add_entry(sums, row + 9, geo.paw_radius)
 
 

@@ -106,9 +106,9 @@ def replay_leg(
     impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[step, leg, world])
     touches = wp.dot(impulse, impulse) > real(0.0)
     if touches:
-        c = contact_at(model, leg, base, paw, solve, inverse, impulse)
+        c = contact_at(model, world, leg, base, paw, solve, inverse, impulse)
         joint = wp.transpose(c.jacobian) * impulse
-        point = contact_point(model, leg, paw, c)
+        point = contact_point(model, world, leg, paw, c)
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)

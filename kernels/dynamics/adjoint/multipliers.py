@@ -138,11 +138,11 @@ def replay_step(
         if wp.dot(impulse, impulse) > real(0.0):
             solve = record.legs[world, i, k]
             paw = record.paws[world, i, k]
-            contact = contact_at(model, k, base, paw, solve, inverse, impulse)
+            contact = contact_at(model, world, k, base, paw, solve, inverse, impulse)
             joint = wp.transpose(contact.jacobian) * impulse
             force_impulse += impulse - wp.transpose(solve.to_lin) * joint
             moment_impulse += (
-                wp.cross(contact_point(model, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
+                wp.cross(contact_point(model, world, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
             )
             solve.free += solve.inverse * (joint / dt)
             record.legs[world, i, k] = solve
@@ -251,8 +251,8 @@ def write_laws(
         impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[at.step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             paw = record.paws[world, i, k]
-            c = contact_at(model, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
-            point = contact_point(model, k, paw, c)
+            c = contact_at(model, world, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
+            point = contact_point(model, world, k, paw, c)
             old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
             velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
             old_impulse = first_impulse[k, world]
@@ -290,7 +290,7 @@ def add_laws(
             law_lin += c.to_lin * y
             law_ang += c.to_ang * y
             m.lin_cotangent += y
-            m.ang_cotangent += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
+            m.ang_cotangent += wp.cross(contact_point(model, at.world, k, record.paws[at.world, at.entry, k], c), y)
             legs[k].rates = legs[k].rates + joint
             legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
     m.lin += law_lin

@@ -39,7 +39,9 @@ def leg_array(module=geometry_module):
         leg.front, leg.side = front, side
         leg.outer_x, leg.inner_x = front * 0.1417, front * 0.0517
         leg.plane_y, leg.knee_y = side * 0.05945, side * 0.00075
-        leg.thigh, leg.shank, leg.paw_radius = 0.175, 0.3, PAW
+        leg.thigh, leg.shank, leg.outer_shank, leg.paw_radius = 0.175, 0.3, 0.3, PAW
+        leg.thigh_radius, leg.shank_radius, leg.housing_radius, leg.housing_length = THIGH, SHANK, HOUSING, 0.19
+        leg.shell = wp.vec3d(1.0, 1.0, 1.0)
         legs.append(leg)
     return wp.array(legs, dtype=module.LegGeometry, device="cpu")
 
@@ -86,19 +88,19 @@ def category_kernel(
     start = 43 * world
     pos = vec3(joint_q[start], joint_q[start + 1], joint_q[start + 2])
     rotation = wp.quat_to_matrix(quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6]))
-    out[world, 0] = collision_module.body_ground_distance(surface, pos, rotation)
+    out[world, 0] = collision_module.body_ground_distance(surface, legs[0].shell, pos, rotation)
     for k in range(1, 5):
         out[world, k] = 1.0e6
     for k in range(5, 8):
         out[world, k] = bound
     for leg in range(4):
-        capsules = collision_module.load_leg(legs, joint_q, start, leg)
+        capsules = collision_module.load_leg(legs, joint_q, 0, start, leg)
         over_ground = collision_module.leg_ground_distances(surface, capsules, pos, rotation)
         for k in range(4):
             out[world, 1 + k] = wp.min(out[world, 1 + k], over_ground[k])
         for earlier in range(leg):
             if leg + earlier != 3:  # not diagonal
-                neighbour = collision_module.load_leg(legs, joint_q, start, earlier)
+                neighbour = collision_module.load_leg(legs, joint_q, 0, start, earlier)
                 distance = collision_module.leg_leg_distance(capsules, neighbour, bound)
                 out[world, 5] = wp.min(out[world, 5], distance)
         out[world, 6] = wp.min(out[world, 6], collision_module.leg_self_distance(capsules, bound))

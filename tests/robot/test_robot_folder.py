@@ -1,0 +1,149 @@
+"""Robots from tables: reading, refusals, lengths of overlays, and their dynamics and kinematics against Pinocchio."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from experiments.dynamics_agreement import differences, jumper_quantities, pinocchio_quantities, random_states
+from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel, paws_kernel
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.export import export_robot
+from jumper_warp.robot.folder import read_robot, read_urdf, robot_of, table_of, write_robot
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.values import RobotValues, described
+from jumper_warp.sim.simulation import Simulation
+from jumper_warp.utils.errors import InputError
+from odd_robot import odd_table, set_value
+
+
+def test_table_of_the_jumper_gives_the_jumper_again(tmp_path):
+    jumper = load_description()
+    write_robot(tmp_path, table_of(jumper, "CAD"))
+    robot = robot_of(read_robot(tmp_path))
+    for ours, theirs in zip(robot.links, jumper.links, strict=True):
+        assert ours.mass == theirs.mass and np.allclose(ours.com, theirs.com, atol=0.0)
+        assert np.allclose(ours.inertia, theirs.inertia, atol=0.0)
+    motions = []
+    for overlay in (None, load_overlay(tmp_path)):
+        sim = Simulation(1, robot=overlay, device="cpu", visuals=False)
+        sim.set_targets(np.tile([0.1, 1.2, 0.9], 4))
+        for _ in range(10):
+            sim.step()
+        motions.append(sim.joint_q())
+    np.testing.assert_array_equal(motions[0], motions[1])
+
+
+def test_dynamics_of_unequal_legs_agree_with_pinocchio():
+    overlay = RobotOverlay({}, robot=odd_table())
+    values, robot = overlay.robots(), overlay.description
+    states = random_states(8, 0, robot)
+    ours, theirs = (of(values, states, robot) for of in (jumper_quantities, pinocchio_quantities))
+    assert max(differences(ours[name], theirs[name])[1] for name in ours) < 1.0e-6
+
+
+def test_inverse_kinematics_bring_paws_beyond_their_ankles_to_their_targets():
+    overlay = RobotOverlay({}, robot=odd_table())
+    sim = Simulation(1, robot=overlay, device="cpu", visuals=False)
+    geometry = sim.dynamics.robot.geometry
+    angles = random_states(20, 1, overlay.description)["angles"].T
+    paws = wp.zeros((4, 20), dtype=wp.vec3, device="cpu")
+    motors = wp.array(angles, dtype=float, device="cpu")
+    wp.launch(paws_kernel, (4, 20), inputs=[geometry, motors], outputs=[paws], device="cpu")
+    oracle = pinocchio_quantities(overlay.robots(), random_states(20, 1, overlay.description), overlay.description)
+    np.testing.assert_allclose(paws.numpy(), oracle["paw_position"].transpose(1, 0, 2), atol=1.0e-6)
+    limits = LegLimits()
+    for name in ("lateral", "transversal", "sum"):
+        setattr(limits, f"{name}_lower", -1.0 if name != "sum" else 0.0)
+        setattr(limits, f"{name}_upper", 2.5 if name != "sum" else 4.5)
+    found = wp.zeros((12, 20), dtype=float, device="cpu")
+    rest = [
+        wp.zeros(shape, dtype=kind, device="cpu")
+        for shape, kind in (((8, 20), float), ((4, 20), int), ((4, 20), float))
+    ]
+    base = [wp.zeros(20, dtype=wp.vec3, device="cpu"), wp.zeros(20, dtype=wp.quat, device="cpu")]
+    inputs = [geometry, limits, *base, paws, 0]
+    wp.launch(inverse_kinematics_kernel, (4, 20), inputs=inputs, outputs=[found, *rest], device="cpu")
+    np.testing.assert_allclose(found.numpy(), angles, atol=2.0e-5)
+
+
+def test_overlay_of_lengths_changes_the_geometry_and_keeps_masses(tmp_path):
+    overlay = RobotOverlay({"shank_length": (0.32,), "thigh_length": (0.18, 0.17), "base_mass": (7.93,)})
+    overlay.save(tmp_path / "long.json")
+    robot = load_overlay(tmp_path / "long.json").description
+    assert [loop.parent_anchor[2] for loop in robot.loops] == 4 * [-0.32]
+    assert [robot.joint(f"{leg}_outer_knee").origin[2] for leg in ("FL", "FR", "BL", "BR")] == [
+        -0.18,
+        -0.18,
+        -0.17,
+        -0.17,
+    ]
+    assert robot.mass == pytest.approx(14.5)
+    assert described(overlay.robots(), robot).mass == pytest.approx(16.0)
+    assert not overlay.is_jumper and RobotOverlay({"base_mass": (7.93,)}).is_jumper
+
+
+def test_motors_of_the_back_legs_have_their_own_torque_and_gains():
+    overlay = RobotOverlay({}, robot=odd_table())
+    sim = Simulation(1, robot=overlay, device="cpu", visuals=False)
+    saturation, kp, peak = (getattr(sim.motors, name).numpy()[:, 0] for name in ("saturation", "kp", "peak"))
+    assert saturation[[1, 7]] == pytest.approx([18.0, 9.0]) and kp[[1, 7]] == pytest.approx([17.0, 12.0])
+    assert peak[[1, 7]] == pytest.approx([24.8, 12.4])
+    again = described(RobotValues.nominal(1, overlay.description), overlay.description)
+    assert [motor.peak_torque for motor in again.motors] == [motor.peak_torque for motor in overlay.description.motors]
+
+
+def test_worlds_take_robots_in_turn_and_move_as_each_alone():
+    tables = [odd_table(), odd_table()]
+    set_value(tables[1]["front"], "inner_shank", 0.3)
+    robots = [RobotOverlay({}, robot=table) for table in tables]
+    motions = []
+    for one in (robots, robots[0], robots[1]):
+        sim = Simulation(4, robot=one, device="cpu", visuals=False)
+        sim.set_targets(np.tile([0.05, 1.3, 1.1], 4))
+        for _ in range(30):
+            sim.step()
+        motions.append(np.hstack([sim.joint_q(), sim.joint_qd()]))
+    np.testing.assert_array_equal(motions[0][::2], motions[1][::2])
+    np.testing.assert_array_equal(motions[0][1::2], motions[2][1::2])
+    assert np.abs(motions[0][0] - motions[0][1]).max() > 1.0e-3
+
+
+def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
+    robot = robot_of(odd_table())
+    read = read_urdf(export_robot("urdf", tmp_path, description=robot))
+    for leg in ("front", "back"):
+        ours, theirs = (table_of(one, "")[leg] for one in (robot, read))
+        for name in ours:
+            if not name.endswith("_motor"):
+                assert ours[name]["value"] == pytest.approx(theirs[name]["value"], abs=1.0e-9), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.pop("back"), "section 'back' is missing: .* Newton or mjlab"),
+        (lambda table: table.update(middle={}), "unknown section 'middle': .* Newton or mjlab"),
+        (lambda table: table["front"].pop("outer_shank"), "front: outer_shank needs .* Newton or mjlab"),
+        (lambda table: table["front"].update(knees={}), "front: unknown quantity 'knees'"),
+        (lambda table: table["front"]["thigh"].update(unit="mm"), "front: the unit of thigh is m, got 'mm'"),
+        (lambda table: set_value(table["front"], "hip", [0.1, 0.1]), "front: hip must be 3 finite numbers"),
+        (lambda table: set_value(table["front"], "outer_shank", 0.01), "shanks of 0.01 and 0.28 m cannot connect"),
+        (lambda table: set_value(table["back"], "lateral_motor", "none"), "BL lateral_motor: no motor 'none'"),
+    ],
+)
+def test_refuses_bad_table(change, message):
+    table = copy.deepcopy(odd_table())
+    change(table)
+    with pytest.raises(InputError, match=message):
+        robot_of(table)
+
+
+def test_robots_of_one_environment_need_equal_poses():
+    robots = [robot_of(odd_table()), dataclasses.replace(robot_of(odd_table()), poses={"default": (0.0, 0.5)})]
+    from jumper_warp.robot.model import build_model
+
+    with pytest.raises(InputError, match="equal poses"):
+        build_model(2, description=robots, device="cpu")

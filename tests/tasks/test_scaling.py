@@ -1,0 +1,62 @@
+"""Tasks in the measures of a robot: the Jumper's numbers stay, those of other robots follow from their sizes."""
+
+import json
+import math
+
+import pytest
+
+from jumper_warp.recipe import Recipe
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.sim.apex import OpenLoopJump, jumper_measures, measure
+from jumper_warp.tasks.scaling import scaled
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_numbers_of_the_jumper_stay_bitwise(name):
+    task = make_task(name)
+    again = scaled(task, RobotOverlay({}).description, jumper_measures(), jumper_measures())
+    assert again == task and repr(again) == repr(task)
+
+
+def test_jumper_reaches_the_height_that_tasks_assume():
+    assert OpenLoopJump(RobotOverlay({})).run() == pytest.approx(jumper_measures().apex, abs=2.0e-4)
+
+
+def test_overlay_of_masses_alone_leaves_a_task_unchanged():
+    assert make_task("vertical-jump", RobotOverlay({"base_mass": (8.0,)})) == make_task("vertical-jump")
+
+
+def test_vertical_jump_of_a_heavy_robot_by_hand():
+    robot = load_overlay("heavy")
+    task, usual, ours = make_task("vertical-jump", robot), make_task("vertical-jump"), measure(robot)
+    gain = (ours.apex - ours.height) / (jumper_measures().apex - jumper_measures().height)
+    top = task.levels[-1].goal_upper[2]
+    assert top == pytest.approx(ours.height + gain * (1.15 - jumper_measures().height))
+    low = ours.height / jumper_measures().height
+    assert task.levels[0].base_height == pytest.approx((0.22 * low, 0.35 * low))
+    terms = {term.name: term for term in (*task.rewards, *task.terminations)}
+    assert terms["ground_force"].numbers["weight_force"] == pytest.approx(40.0 * 9.81)
+    assert terms["low_base"].numbers["height"] == pytest.approx(0.10 * low)
+    torque = 0.5 * (95.7793 + 86.2014)
+    assert terms["motor_torque_sq"].weight == pytest.approx(-5.0e-4 * (24.8 / torque) ** 2)
+    assert task.motors.transversal.saturation == pytest.approx(18.0 / 24.8 * 95.7793)
+    assert task.advance.numbers["takeoff_speed"] == pytest.approx(0.75 * math.sqrt(0.695 / 0.475))
+    assert terms["tilted"] == {term.name: term for term in usual.terminations}["tilted"]
+
+
+def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only():
+    task = make_task("velocity-flat", load_overlay("small_direct_drive"))
+    settings = task.reset.settings
+    assert settings.tilt == 0.0 and settings.front_y[0] == settings.front_y[1] == pytest.approx(0.11)
+    ahead, back, aside, turning = task.levels[0].last_range
+    assert min(ahead, back) > 1.0 and max(aside, turning) < 0.01
+    assert task.command_filter.lateral.upper == 0.01
+
+
+def test_recipe_keeps_its_robot():
+    robot = RobotOverlay({"shank_length": (0.32,)}, robot=load_overlay("heavy").robot)
+    recipe = Recipe.of("horizontal-jump", robot)
+    again = Recipe.from_json(json.loads(json.dumps(recipe.to_json())))
+    assert again.task == recipe.task and again.robot.to_json() == robot.to_json()
+    assert again.robot.description.links[0].mass == robot.description.links[0].mass
