@@ -24,12 +24,15 @@ class Log:
     """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
     def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
-        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv."""
+        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv.
+
+        Raises FileExistsError: the folder has a log.
+        """
         folder.mkdir(parents=True, exist_ok=True)
+        self._ticks = (folder / TICKS).open("xb")
         about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
-        self._ticks = (folder / TICKS).open("wb")
         self.frame = can.Logger(str(folder / frames))  # writes a frame, for `Link`
 
     def tick(self, record: np.ndarray) -> None:

@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     flags.add_argument("--check", action="store_true", help="compare the bundle with its conformance vectors, and end")
     flags.add_argument("--replay", type=Path, metavar="LOG", help="run a log through the runtime, and compare commands")
     flags.add_argument("--bus", help="socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER")
-    flags.add_argument("--rate", type=int, choices=(480, 500), help="ticks a second (default: of deploy.yaml)")
+    flags.add_argument("--rate", type=int, choices=RATES, help="ticks a second (default: of deploy.yaml)")
     flags.add_argument("--dry-run", action="store_true", help="compute commands, and keep the motors off")
     flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
     flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
@@ -59,11 +59,12 @@ def main(args: Sequence[str] | None = None) -> None:
         if not options.bus:
             raise InputError("--bus, --check or --replay is needed")
         run(bundle, options)
-    except InputError as error:
+    except (InputError, OSError) as error:
         print(f"jumper deploy: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
+RATES = (480, 500)  # [Hz]
 DEMO = (
     (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
@@ -73,12 +74,16 @@ DEMO = (
 
 def run(bundle: Bundle, options: argparse.Namespace) -> None:
     """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
-    rate = options.rate or int(bundle.settings["rate"])
-    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
+    rate = options.rate or bundle.settings.get("rate")
+    if rate not in RATES or not options.seconds > 0.0:
+        raise InputError(f"the rate must be 480 or 500 Hz and seconds above 0, got {rate} and {options.seconds}")
     pump = (lambda: None) if options.lockstep else None
-    link = Link(open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
-    source = MotionCapture() if options.capture else None
-    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    with bundle.reading():
+        link = Link([], reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
+        source = MotionCapture() if options.capture else None
+        runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    link.buses = open_buses(options.bus)
+    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
     if log is not None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
@@ -99,7 +104,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     try:
         with raw_terminal():
             if options.lockstep:
-                for _ in range(round(options.seconds * rate)):
+                for _ in itertools.takewhile(lambda number: number < options.seconds * rate, itertools.count()):
                     tick(0.0)
             else:
                 request_real_time()

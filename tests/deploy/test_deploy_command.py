@@ -1,0 +1,113 @@
+"""`jumper deploy`: wrong settings and flags, a log that exists, and a far end in lockstep that stops."""
+
+import shutil
+import threading
+
+import pytest
+import yaml
+
+from jumper_warp.cli.bus_sim import run as bus_sim
+from jumper_warp.deploy import bus, main
+from jumper_warp.deploy.bundle import FILE, Bundle
+from jumper_warp.deploy.check import check_bundle
+from jumper_warp.utils.errors import InputError
+
+
+def refusal(capsys, *args):
+    """Run the command, which must exit with code 2, and return its line on standard error."""
+    with pytest.raises(SystemExit) as end:
+        main.main([str(arg) for arg in args])
+    assert end.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"- 1\n", b"a: [1,\n", b"version: 1\n", bytes(range(256))],
+    ids=["no", "list", "cut", "short", "bytes"],
+)
+def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    (folder / FILE).write_bytes(text)
+    with pytest.raises(InputError, match=r"deploy\.yaml"):
+        Bundle(folder)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("joint_ids_map",), [0, 1, 2]), (("joint_offsets",), [float("nan")] * 12), (("hold", "damping"), [1.0, 2.0]),
+        (("torque_curve",), {}), (("policies",), []), (("files",), None), (("estimator",), None), (("safety",), {}),
+        (("policies", "vertical_jump", "stiffness"), [1.0, 2.0]), (("policies", "vertical_jump", "commands"), None),
+        (("policies", "vertical_jump", "command_filter"), {}), (("policies", "vertical_jump", "skill"), "fly"),
+    ],
+    ids=lambda x: x[-1] if isinstance(x, tuple) else "",
+)  # fmt: skip
+def test_wrong_setting_is_refused_by_the_check(place, value, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    section = settings
+    for name in place[:-1]:
+        section = section[name]
+    section[place[-1]] = value
+    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+    with pytest.raises(InputError, match=r"deploy\.yaml"):
+        check_bundle(Bundle(folder))
+
+
+@pytest.mark.parametrize("rate", [0, -480, "abc", 1000])
+def test_wrong_rate_is_refused(rate, bundle_folder, tmp_path, capsys):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    (folder / FILE).write_text(yaml.safe_dump(settings | {"rate": rate}, sort_keys=False))
+    assert "rate must be" in refusal(capsys, folder, "--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
+
+
+@pytest.mark.parametrize("seconds", [0, -1, "nan"])
+def test_wrong_time_is_refused(seconds, bundle_folder, tmp_path, capsys):
+    assert "seconds above 0" in refusal(capsys, bundle_folder, "--bus", f"unix:{tmp_path}/bus", f"--seconds={seconds}")
+
+
+def test_bus_without_a_folder_is_refused(bundle_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert "bus must be" in refusal(capsys, bundle_folder, "--bus", "unix:", "--seconds", 0.01)
+    assert not list(tmp_path.iterdir())
+
+
+def test_log_that_exists_is_kept(bundle_folder, tmp_path, capsys):
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "ticks.bin").write_bytes(b"recorded")
+    args = ("--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01, "--log", tmp_path / "log")
+    assert "File exists" in refusal(capsys, bundle_folder, *args)
+    assert [path.name for path in (tmp_path / "log").iterdir()] == ["ticks.bin"]
+    assert (tmp_path / "log" / "ticks.bin").read_bytes() == b"recorded"
+
+
+def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bus, "LOCKSTEP_TIMEOUT", 0.3)
+    spec = f"unix:{tmp_path}/bus"
+    far = bus.open_buses(spec, "robot")
+    ticks = []
+
+    def serve():
+        """Answer three ticks without frames."""
+        for tick in range(3):
+            for each in far:
+                while each.recv(20.0).arbitration_id != bus.SYNC:
+                    pass
+                each.send(bus.data_frame(bus.SYNC, b""))
+            ticks.append(tick)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    assert "no frames in lockstep" in refusal(capsys, bundle_folder, "--bus", spec, "--lockstep")
+    thread.join()
+    assert ticks == [0, 1, 2]
+    for each in far:
+        each.shutdown()
+
+
+@pytest.mark.parametrize("flag", [("--rate", "0"), ("--seed", "-1")])
+def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
+    with pytest.raises(InputError, match=flag[0].strip("-")):
+        bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])
