@@ -16,6 +16,7 @@ from jumper_warp.deploy.log import Log, replay
 from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
 from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.safety import Fault
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
 from jumper_warp.utils.errors import InputError
@@ -89,17 +90,17 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Keyboard(options.height, options.place)
     script = {round(at * rate): (request, values) for at, request, values in DEMO}
-    ticks, last = itertools.count(), State.PASSIVE
+    ticks, last = itertools.count(), (State.PASSIVE, Fault.NONE)
 
     def tick(late: float) -> None:
-        """Run a tick with the operator's request, and print changes of the state."""
+        """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""
         nonlocal last
         runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
         if dog is not None:
             dog.beat()
-        if runtime.state != last:
-            last = runtime.state
-            print(f"{last.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
+        if (runtime.state, runtime.reason) != last:
+            last = (runtime.state, runtime.reason)
+            print(f"{runtime.state.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
 
     try:
         with raw_terminal():

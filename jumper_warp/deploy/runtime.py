@@ -175,8 +175,8 @@ class Runtime:
             frames[self.bundle.joints.motor[int(values[0])]] = np.frombuffer(ZERO, np.uint8)
             self._rest_ticks = 0
             return frames
-        if request == Request.STAND and self.ready:
-            self.reason = self.safety.fault
+        if request == Request.STAND:
+            self.reason = self.safety.fault if self.ready else Fault.SILENT
             if not self.reason:
                 self._enter(State.STAND_UP)
                 return np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))

@@ -83,28 +83,43 @@ def test_log_that_exists_is_kept(bundle_folder, tmp_path, capsys):
     assert (tmp_path / "log" / "ticks.bin").read_bytes() == b"recorded"
 
 
-def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(bus, "LOCKSTEP_TIMEOUT", 0.3)
+@pytest.fixture
+def silent_robot(tmp_path):
+    """Function that answers some ticks of a runtime in lockstep, without frames, and returns the buses."""
     spec = f"unix:{tmp_path}/bus"
     far = bus.open_buses(spec, "robot")
-    ticks = []
+    threads = []
 
-    def serve():
-        """Answer three ticks without frames."""
-        for tick in range(3):
+    def answer(ticks):
+        """End the frames of each tick."""
+        for _ in range(ticks):
             for each in far:
                 while each.recv(20.0).arbitration_id != bus.SYNC:
                     pass
                 each.send(bus.data_frame(bus.SYNC, b""))
-            ticks.append(tick)
 
-    thread = threading.Thread(target=serve)
-    thread.start()
-    assert "no frames in lockstep" in refusal(capsys, bundle_folder, "--bus", spec, "--lockstep")
-    thread.join()
-    assert ticks == [0, 1, 2]
+    def start(ticks):
+        """Answer in the background."""
+        threads.append(threading.Thread(target=answer, args=(ticks,)))
+        threads[0].start()
+        return spec
+
+    yield start
+    threads[0].join()
     for each in far:
         each.shutdown()
+
+
+def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, silent_robot, monkeypatch, capsys):
+    monkeypatch.setattr(bus, "LOCKSTEP_TIMEOUT", 0.3)
+    assert "no frames in lockstep" in refusal(capsys, bundle_folder, "--bus", silent_robot(3), "--lockstep")
+
+
+def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot, capsys):
+    """No motor replies, so that the request to stand is refused."""
+    ticks = 300 + 480 + 4  # of the run, and of its end
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
+    assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
 
 
 @pytest.mark.parametrize("flag", [("--rate", "0"), ("--seed", "-1")])
