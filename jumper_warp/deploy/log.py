@@ -11,7 +11,7 @@ import can
 import numpy as np
 
 from jumper_warp.deploy.bundle import FILE, Bundle
-from jumper_warp.deploy.runtime import TICK, Request, Runtime
+from jumper_warp.deploy.runtime import RATES, TICK, Request, Runtime
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_file, read_json
@@ -48,10 +48,14 @@ class Log:
 def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
     about = read_json(folder / ABOUT, "log of a robot")
-    if about.get("version") != VERSION or about.get("tick_bytes") != TICK.itemsize:
-        raise InputError(f"{folder / ABOUT}: written by another version of the runtime")
+    known = {"version": [VERSION], "tick_bytes": [TICK.itemsize], "rate": RATES, "capture": [False, True]}
+    if not isinstance(about, dict) or any(about.get(name) not in values for name, values in known.items()):
+        raise InputError(f"{folder / ABOUT}: damaged, or written by another version of the runtime")
     data = read_file(folder / TICKS, "ticks of a log")
-    return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), about
+    ticks = np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK)
+    if not len(ticks) or not np.isin(ticks["request"], [*Request]).all():
+        raise InputError(f"{folder / TICKS}: no ticks, or damaged")
+    return ticks, about
 
 
 def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import Log, replay
 from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
-from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.runtime import RATES, Request, Runtime, State
 from jumper_warp.deploy.safety import Fault
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
@@ -65,7 +65,6 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(2) from None
 
 
-RATES = (480, 500)  # [Hz]
 DEMO = (
     (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),

@@ -33,6 +33,7 @@ SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
 JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
 DRIVERLESS = (State.PASSIVE, State.DAMP, State.LANDING)  # states that a fault does not end
+RATES = (480, 500)  # [Hz] ticks a second
 REST_TICKS = 96  # over which the readings of a robot at rest are averaged
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
 TICK = np.dtype([

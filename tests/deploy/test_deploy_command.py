@@ -1,15 +1,20 @@
-"""`jumper deploy`: wrong settings and flags, a log that exists, and a far end in lockstep that stops."""
+"""`jumper deploy` and exports for it: wrong settings and flags, damaged logs, a far end that stops."""
 
+import json
 import shutil
 import threading
 
+import numpy as np
 import pytest
 import yaml
 
 from jumper_warp.cli.bus_sim import run as bus_sim
+from jumper_warp.cli.export import run as export
 from jumper_warp.deploy import bus, main
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.check import check_bundle
+from jumper_warp.deploy.log import read_log
+from jumper_warp.deploy.runtime import TICK
 from jumper_warp.utils.errors import InputError
 
 
@@ -120,6 +125,47 @@ def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot,
     ticks = 300 + 480 + 4  # of the run, and of its end
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
     assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
+
+
+ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsize}
+
+
+@pytest.mark.parametrize(
+    ("about", "ticks"),
+    [
+        ([1], 3), (ABOUT | {"rate": 0}, 3), (ABOUT | {"rate": "x"}, 3), ({"version": 1}, 3), (ABOUT, 0),
+        (ABOUT | {"capture": None}, 3), (ABOUT, -3),
+    ],
+)  # fmt: skip
+def test_damaged_log_is_refused(about, ticks, tmp_path):
+    """A negative number of ticks: they have a request that does not exist."""
+    records = np.zeros(abs(ticks), TICK)
+    records["request"] = 0 if ticks >= 0 else -90
+    (tmp_path / "log.json").write_text(json.dumps(about))
+    (tmp_path / "ticks.bin").write_bytes(records.tobytes())
+    with pytest.raises(InputError, match="damaged"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [["--bundle", "--page", "p"], ["--bundle", "--blend", "vertical_jump", "0.5"], ["--page", "p", "--out", "q"]],
+)
+def test_flags_of_two_exports_are_refused(flags, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="exclude each other"):
+        export(["vertical_jump", *flags])
+    assert not list(tmp_path.iterdir())
+
+
+def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    (folder / "jumper.dbc").write_text("changed")
+    with pytest.raises(InputError, match="overwrite replaces it"):
+        export(["vertical_jump", "--bundle", "--out", str(folder)])
+    export(["vertical_jump", "--bundle", "--out", str(folder), "--overwrite"])
+    assert check_bundle(Bundle(folder)) == []
+    assert (folder / "jumper.dbc").read_bytes() == (bundle_folder / "jumper.dbc").read_bytes()
 
 
 @pytest.mark.parametrize("flag", [("--rate", "0"), ("--seed", "-1")])
