@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,16 +35,30 @@ class Log:
         about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
-        self.frame = can.Logger(str(folder / frames))  # writes a frame, for `Link`
+        self._frames = can.Logger(str(folder / frames))
+        self.full = False  # whether a write has failed; then the robot continues without a log
 
     def tick(self, record: np.ndarray) -> None:
         """Write the record of a tick."""
-        self._ticks.write(record.tobytes())
+        self._write(self._ticks.write, record.tobytes())
+
+    def frame(self, message: can.Message) -> None:
+        """Write a frame, for `Link`."""
+        self._write(self._frames, message)
+
+    def _write(self, write: Callable[[Any], object], data: Any) -> None:
+        """Write data; a full disk ends the log, not the run."""
+        if not self.full:
+            try:
+                write(data)
+            except OSError as error:
+                self.full = True
+                print(f"the log ends, the robot continues: {error}", file=sys.stderr)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files. Raises OSError: the disk is full."""
         self._ticks.close()
-        self.frame.stop()
+        self._frames.stop()
 
 
 def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,6 +46,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command; exits with 1 if a check fails, and with 2 and one line if the input is invalid."""
     options = parser().parse_args(args)
+    logging.getLogger("can.bus").setLevel(logging.ERROR)  # after an error, buses are closed with the process
     try:
         bundle = Bundle(options.bundle)
         if bundle.edited:

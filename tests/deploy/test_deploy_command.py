@@ -1,9 +1,11 @@
 """`jumper deploy` and exports for it: wrong settings and flags, damaged logs, a far end that stops."""
 
+import errno
 import json
 import shutil
 import threading
 
+import can
 import numpy as np
 import pytest
 import yaml
@@ -125,6 +127,34 @@ def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot,
     ticks = 300 + 480 + 4  # of the run, and of its end
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
     assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
+
+
+def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp_path, monkeypatch, capsys):
+    """The third write of a frame fails."""
+    written = []
+
+    class Full:
+        """Logger on a disk for two frames."""
+
+        def __init__(self, path):
+            self.path = path
+
+        def __call__(self, message):
+            """Write, or fail."""
+            written.append(message)
+            if len(written) > 2:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        def stop(self):
+            """Do nothing."""
+
+    monkeypatch.setattr(can, "Logger", Full)
+    ticks = 300 + 480 + 4  # of the run, and of its end
+    args = ["--demo", "--lockstep", "--seconds", str(300 / 480), "--log", str(tmp_path / "log")]
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), *args])
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == ["PASSIVE SILENT"]
+    assert printed.err.count("the log ends, the robot continues") == 1 and len(written) == 3
 
 
 ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsize}
