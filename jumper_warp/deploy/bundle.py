@@ -56,6 +56,7 @@ class Bundle:
         self.hold = Gains.from_yaml(self.settings["hold"])
         self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
         self.joints.frames(self.default, self.hold.kp, self.hold.kd)  # ValueError: of another size, or NaN
+        self.joints.frames(self.default, self.hold.kp, np.array(self.settings["safety"]["damping"]))
         self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
         self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
 
@@ -70,8 +71,8 @@ class Bundle:
         """Load a policy with the settings of its section of deploy.yaml."""
         policy = DeployedPolicy(self.file(fields["file"]))
         action = fields["actions"]["JointPositionAction"]
-        policy.scale = np.array(action["scale"], dtype=np.float32)
-        policy.default = np.array(action["offset"], dtype=np.float32)
+        policy.scale[:] = action["scale"]
+        policy.default[:] = action["offset"]
         policy.interface["command_filter"] = fields["command_filter"]
         terms = fields["observations"]
         if list(terms) != list(policy.layout):
@@ -79,7 +80,7 @@ class Bundle:
         for name, term in terms.items():
             if term["history_length"] != policy.layout[name]["history"]:
                 raise InputError(f"{self.folder / FILE}: {name} needs a history of {policy.layout[name]['history']}")
-            policy.layout[name] |= {"scale": term["scale"], "clip": term["clip"][1]}
+            policy.layout[name] |= {"scale": float(term["scale"]), "clip": float(term["clip"][1])}
         target = policy.filter_targets(policy.default + policy.scale * policy.action, policy.default, policy.action)
         self.joints.frames(target, *Gains.from_yaml(fields)[:2])  # as for `hold`
         return policy

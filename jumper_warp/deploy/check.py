@@ -25,10 +25,10 @@ def check_bundle(bundle: Bundle) -> list[str]:
     differences = []
     with bundle.reading():
         Runtime(bundle, Link([]))  # reads the other settings
-    for name in bundle.policies:
-        with np.load(bundle.file(f"{name}.npz"), allow_pickle=False) as file:
-            vectors = {key: file[key] for key in file.files}
-        differences += [f"{name}: {line}" for line in _check_policy(bundle, name, vectors)]
+        for name in bundle.policies:
+            with np.load(bundle.file(f"{name}.npz"), allow_pickle=False) as file:
+                vectors = {key: file[key] for key in file.files}
+            differences += [f"{name}: {line}" for line in _check_policy(bundle, name, vectors)]
     return differences
 
 

@@ -46,6 +46,8 @@ def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
         (("joint_ids_map",), [0, 1, 2]), (("joint_offsets",), [float("nan")] * 12), (("hold", "damping"), [1.0, 2.0]),
         (("torque_curve",), {}), (("policies",), []), (("files",), None), (("estimator",), None), (("safety",), {}),
         (("policies", "vertical_jump", "stiffness"), [1.0, 2.0]), (("policies", "vertical_jump", "commands"), None),
+        (("safety", "damping"), []), (("policies", "vertical_jump", "observations", "angle", "scale"), []),
+        (("policies", "vertical_jump", "actions", "JointPositionAction", "scale"), [1.0, 2.0]),
         (("policies", "vertical_jump", "command_filter"), {}), (("policies", "vertical_jump", "skill"), "fly"),
     ],
     ids=lambda x: x[-1] if isinstance(x, tuple) else "",
