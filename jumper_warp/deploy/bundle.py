@@ -34,7 +34,17 @@ class Bundle:
         """
         self.folder = Path(folder)
         with self.reading():
-            self._load(read_file(self.folder / FILE, "settings of a bundle"))
+            self.settings: dict[str, Any] = yaml.safe_load(read_file(self.folder / FILE, "settings of a bundle"))
+            if self.settings.get("version") != VERSION:
+                raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
+            self.joints = JointMap(self.settings)
+            self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
+            self.hold = Gains.from_yaml(self.settings["hold"])
+            self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
+            self.joints.frames(self.default, self.hold.kp, self.hold.kd)  # ValueError: of another size, or NaN
+            self.joints.frames(self.default, self.hold.kp, np.array(self.settings["safety"]["damping"]))
+            self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
+            self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
 
     @contextmanager
     def reading(self) -> Iterator[None]:
@@ -45,20 +55,6 @@ class Bundle:
             raise
         except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{self.folder / FILE}: {type(error).__name__}: {error!s:.200}") from error
-
-    def _load(self, data: bytes) -> None:
-        """Read deploy.yaml and load the policies; errors: those of the settings' types."""
-        self.settings: dict[str, Any] = yaml.safe_load(data)
-        if self.settings.get("version") != VERSION:
-            raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
-        self.joints = JointMap(self.settings)
-        self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
-        self.hold = Gains.from_yaml(self.settings["hold"])
-        self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
-        self.joints.frames(self.default, self.hold.kp, self.hold.kd)  # ValueError: of another size, or NaN
-        self.joints.frames(self.default, self.hold.kp, np.array(self.settings["safety"]["damping"]))
-        self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
-        self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
 
     def file(self, name: str) -> Path:
         """Return the path of a file of the bundle. Raises InputError: it differs from its hash in deploy.yaml."""

@@ -6,6 +6,7 @@ import argparse
 import itertools
 import json
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,6 @@ from jumper_warp.deploy.log import Log, replay
 from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
 from jumper_warp.deploy.runtime import RATES, Request, Runtime, State
-from jumper_warp.deploy.safety import Fault
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
 from jumper_warp.utils.errors import InputError
@@ -46,6 +46,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command; exits with 1 if a check fails, and with 2 and one line if the input is invalid."""
     options = parser().parse_args(args)
+    sys.stdin = sys.stdin or Path(os.devnull).open()  # None: closed
     logging.getLogger("can.bus").setLevel(logging.ERROR)  # after an error, buses are closed with the process
     try:
         bundle = Bundle(options.bundle)
@@ -91,7 +92,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Keyboard(options.height, options.place)
     script = {round(at * rate): (request, values) for at, request, values in DEMO}
-    ticks, last = itertools.count(), (State.PASSIVE, Fault.NONE)
+    ticks, last = itertools.count(), (State.PASSIVE, 0)
 
     def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""

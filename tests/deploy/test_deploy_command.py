@@ -204,3 +204,9 @@ def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
 def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
     with pytest.raises(InputError, match=flag[0].strip("-")):
         bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])
+
+
+def test_closed_standard_input_is_no_terminal(bundle_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", None)
+    main.main([str(bundle_folder), "--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"])
+    assert '"ticks"' in capsys.readouterr().out
