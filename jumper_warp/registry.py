@@ -312,6 +312,9 @@ def load_installed(point: EntryPoint) -> None:
     _register(point.name, result if isinstance(result, TaskEntry) else TaskEntry(make))
 
 
+LOADED: list[str] = []  # Names of the user's files and modules, in whose files an exception is the user's mistake
+
+
 def load_task_module(name: str) -> ModuleType:
     """Import a user's FILE.py or module, which registers tasks; after an exception `TASKS` is unchanged.
 
@@ -319,6 +322,7 @@ def load_task_module(name: str) -> ModuleType:
     OSError: the file cannot be read.
     """
     path, before = Path(name), dict(TASKS)
+    LOADED.append(name)
     try:
         if path.suffix == ".py" or len(path.parts) > 1:
             return _load_file(path)

@@ -8,6 +8,7 @@ from types import ModuleType
 
 from jumper_warp.bench.faults import BusFaults
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.checks import check_count, check_seed
 
 
 @dataclass
@@ -33,6 +34,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.bench.pace import serve_in_real_time
     from jumper_warp.deploy.bus import open_buses
 
+    check_count("rate", cfg.rate)
+    check_seed(cfg.seed)
     far = BusSim(open_buses(cfg.bus, "robot"), cfg, sim=make_simulation(1.0 / cfg.rate, cfg.friction))
     print(f"bus-sim on {cfg.bus}", flush=True)
     try:

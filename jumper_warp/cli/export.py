@@ -61,6 +61,8 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
+    if (cfg.page is not None) + cfg.bundle + (cfg.blend is not None) > 1 or None not in (cfg.page, cfg.out):
+        raise InputError("--page, --bundle and --blend exclude each other, and so do --page and --out")
     if cfg.page is not None:
         return export_page(cfg, cfg.page)
     if cfg.bundle and cfg.sources:
@@ -123,11 +125,12 @@ def export_page(cfg: ExportCfg, folder: Path) -> Path:
 
 def export_for_robot(cfg: ExportCfg) -> Path:
     """Write a bundle of several policies, print its folder and return it. Raises InputError: see `export_bundle`."""
-    from jumper_warp.bench.bundle import export_bundle
+    from jumper_warp.bench.bundle import FILE, export_bundle
     from jumper_warp.policies.policy import Policy, checked_folder
 
     folder = cfg.out or Path("bundle")
-    checked_folder(folder, cfg.overwrite)
+    if not (cfg.overwrite and (folder / FILE).is_file()):
+        checked_folder(folder, cfg.overwrite)
     named = [(Path(source).name.replace("-", "_"), Policy.load(source, newest=cfg.newest)) for source in cfg.sources]
     print(export_bundle(named, folder))
     return folder

@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def dispatch(args: Sequence[str]) -> None:
-    """Run the command named by the first argument; errors in files of --task-module become InputError.
+    """Run the command named by the first argument; errors in files of tasks become InputError.
 
     Raises UsageError: there is no such command. Other exceptions are the command's.
     """
@@ -111,7 +111,9 @@ def dispatch(args: Sequence[str]) -> None:
             modules += (load_task_module(file) for file in files)
         importlib.import_module(f"jumper_warp.cli.{MODULES.get(name, name)}").run(rest, modules)
     except Exception as error:
-        paths = [*files, *(getattr(module, "__file__", None) for module in modules)]
+        from jumper_warp.registry import LOADED
+
+        paths = [*LOADED, *(getattr(module, "__file__", None) for module in modules)]
         folders = {os.path.dirname(os.path.abspath(path)) for path in paths if path}
         if message := user_file_error(folders, error):
             raise InputError(message) from error

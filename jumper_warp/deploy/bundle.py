@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +30,31 @@ class Bundle:
     def __init__(self, folder: str | Path) -> None:
         """Read deploy.yaml and load the policies.
 
-        Raises InputError: a file is missing, differs from its hash, or does not fit the others.
+        Raises InputError: a file is missing, differs from its hash, or does not fit the others, or a setting is wrong.
         """
         self.folder = Path(folder)
-        data = read_file(self.folder / FILE, "settings of a bundle")
-        self.settings: dict[str, Any] = yaml.safe_load(data)
-        if self.settings.get("version") != VERSION:
-            raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
-        self.joints = JointMap(self.settings)
-        self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
-        self.hold = Gains.from_yaml(self.settings["hold"])
-        self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
-        self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
-        self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
+        with self.reading():
+            self.settings: dict[str, Any] = yaml.safe_load(read_file(self.folder / FILE, "settings of a bundle"))
+            if self.settings.get("version") != VERSION:
+                raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
+            self.joints = JointMap(self.settings)
+            self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
+            self.hold = Gains.from_yaml(self.settings["hold"])
+            self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
+            self.joints.frames(self.default, self.hold.kp, self.hold.kd)  # ValueError: of another size, or NaN
+            self.joints.frames(self.default, self.hold.kp, np.array(self.settings["safety"]["damping"]))
+            self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
+            self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read settings in a block, whose errors about missing or wrong ones become InputError."""
+        try:
+            yield
+        except InputError:
+            raise
+        except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{self.folder / FILE}: {type(error).__name__}: {error!s:.200}") from error
 
     def file(self, name: str) -> Path:
         """Return the path of a file of the bundle. Raises InputError: it differs from its hash in deploy.yaml."""
@@ -54,8 +67,8 @@ class Bundle:
         """Load a policy with the settings of its section of deploy.yaml."""
         policy = DeployedPolicy(self.file(fields["file"]))
         action = fields["actions"]["JointPositionAction"]
-        policy.scale = np.array(action["scale"], dtype=np.float32)
-        policy.default = np.array(action["offset"], dtype=np.float32)
+        policy.scale[:] = action["scale"]
+        policy.default[:] = action["offset"]
         policy.interface["command_filter"] = fields["command_filter"]
         terms = fields["observations"]
         if list(terms) != list(policy.layout):
@@ -63,7 +76,9 @@ class Bundle:
         for name, term in terms.items():
             if term["history_length"] != policy.layout[name]["history"]:
                 raise InputError(f"{self.folder / FILE}: {name} needs a history of {policy.layout[name]['history']}")
-            policy.layout[name] |= {"scale": term["scale"], "clip": term["clip"][1]}
+            policy.layout[name] |= {"scale": float(term["scale"]), "clip": float(term["clip"][1])}
+        target = policy.filter_targets(policy.default + policy.scale * policy.action, policy.default, policy.action)
+        self.joints.frames(target, *Gains.from_yaml(fields)[:2])  # as for `hold`
         return policy
 
 

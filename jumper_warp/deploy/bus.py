@@ -91,7 +91,7 @@ def open_buses(spec: str, side: str = "host") -> list[can.BusABC]:
         if kind == "udp_multicast":
             ports = range(int(channel), int(channel) + LEGS)  # one port a bus: groups cross-talk
             return [can.Bus(interface="udp_multicast", channel="239.74.163.2", port=p, hop_limit=0) for p in ports]
-        if kind == "unix":
+        if kind == "unix" and channel:
             Path(channel).mkdir(mode=0o700, parents=True, exist_ok=True)
             far = "robot" if side != "robot" else "host"
             own = {i: Path(channel, f"{side}{i}") for i in range(LEGS) if side != "watchdog"}
@@ -138,7 +138,7 @@ class Link:
     def collect(self) -> np.ndarray:
         """Return the frames received since the last call, a record of RECEIVED; waits until all came or the deadline.
 
-        Data of frames that did not come are the last ones received.
+        Data of frames that did not come are the last ones received. Raises InputError: no far end in lockstep.
         """
         record = self.received
         for name in ("motor_fresh", "sensor_fresh", "error_frames", "unknown"):
@@ -148,6 +148,9 @@ class Link:
             for leg, bus in enumerate(self.buses):
                 while (message := bus.recv(LOCKSTEP_TIMEOUT)) is not None and message.arbitration_id != SYNC:
                     self._take(leg, message)
+                if message is None:
+                    self._pump = None  # the last ticks, which brake, do not wait
+                    raise InputError(f"no frames in lockstep for {LOCKSTEP_TIMEOUT:g} s: run jumper bus-sim --lockstep")
             return record.copy()
         end = time.monotonic() + self._deadline
         waiting = {bus.fileno(): leg for leg, bus in enumerate(self.buses)}

@@ -9,19 +9,26 @@ from __future__ import annotations
 import numpy as np
 
 from jumper_warp.deploy.bundle import Bundle
+from jumper_warp.deploy.bus import Link
 from jumper_warp.deploy.codec import Codec
+from jumper_warp.deploy.runtime import Runtime
 from jumper_warp.utils.errors import InputError
 
 TOLERANCE = 1.0e-5  # of observations and actions; rounding of the network's sums
 
 
 def check_bundle(bundle: Bundle) -> list[str]:
-    """Return a line for each difference between a bundle and its vectors; an empty list: it conforms."""
+    """Return a line for each difference between a bundle and its vectors; an empty list: it conforms.
+
+    Raises InputError: a setting is missing or of a wrong type.
+    """
     differences = []
-    for name in bundle.policies:
-        with np.load(bundle.file(f"{name}.npz"), allow_pickle=False) as file:
-            vectors = {key: file[key] for key in file.files}
-        differences += [f"{name}: {line}" for line in _check_policy(bundle, name, vectors)]
+    with bundle.reading():
+        Runtime(bundle, Link([]))  # reads the other settings
+        for name in bundle.policies:
+            with np.load(bundle.file(f"{name}.npz"), allow_pickle=False) as file:
+                vectors = {key: file[key] for key in file.files}
+            differences += [f"{name}: {line}" for line in _check_policy(bundle, name, vectors)]
     return differences
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +13,7 @@ import can
 import numpy as np
 
 from jumper_warp.deploy.bundle import FILE, Bundle
-from jumper_warp.deploy.runtime import TICK, Request, Runtime
+from jumper_warp.deploy.runtime import RATES, TICK, Request, Runtime
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_file, read_json
@@ -24,31 +26,52 @@ class Log:
     """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
     def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
-        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv."""
+        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv.
+
+        Raises FileExistsError: the folder has a log.
+        """
         folder.mkdir(parents=True, exist_ok=True)
+        self._ticks = (folder / TICKS).open("xb")
         about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
-        self._ticks = (folder / TICKS).open("wb")
-        self.frame = can.Logger(str(folder / frames))  # writes a frame, for `Link`
+        self._frames = can.Logger(str(folder / frames))
+        self.full = False  # whether a write has failed; then the robot continues without a log
 
     def tick(self, record: np.ndarray) -> None:
         """Write the record of a tick."""
-        self._ticks.write(record.tobytes())
+        self._write(self._ticks.write, record.tobytes())
+
+    def frame(self, message: can.Message) -> None:
+        """Write a frame, for `Link`."""
+        self._write(self._frames, message)
+
+    def _write(self, write: Callable[[Any], object], data: Any) -> None:
+        """Write data; a full disk ends the log, not the run."""
+        if not self.full:
+            try:
+                write(data)
+            except OSError as error:
+                self.full = True
+                print(f"the log ends, the robot continues: {error}", file=sys.stderr)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files. Raises OSError: the disk is full."""
         self._ticks.close()
-        self.frame.stop()
+        self._frames.stop()
 
 
 def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
     about = read_json(folder / ABOUT, "log of a robot")
-    if about.get("version") != VERSION or about.get("tick_bytes") != TICK.itemsize:
-        raise InputError(f"{folder / ABOUT}: written by another version of the runtime")
+    known = {"version": [VERSION], "tick_bytes": [TICK.itemsize], "rate": RATES, "capture": [False, True]}
+    if not isinstance(about, dict) or any(about.get(name) not in values for name, values in known.items()):
+        raise InputError(f"{folder / ABOUT}: damaged, or written by another version of the runtime")
     data = read_file(folder / TICKS, "ticks of a log")
-    return np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK), about
+    ticks = np.frombuffer(data[: len(data) - len(data) % TICK.itemsize], TICK)
+    if not len(ticks) or not np.isin(ticks["request"], [*Request]).all():
+        raise InputError(f"{folder / TICKS}: no ticks, or damaged")
+    return ticks, about
 
 
 def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:

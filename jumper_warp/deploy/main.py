@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +17,7 @@ from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import Log, replay
 from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
 from jumper_warp.deploy.realtime import request_real_time, run_loop
-from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.runtime import RATES, Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
 from jumper_warp.utils.errors import InputError
@@ -29,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     flags.add_argument("--check", action="store_true", help="compare the bundle with its conformance vectors, and end")
     flags.add_argument("--replay", type=Path, metavar="LOG", help="run a log through the runtime, and compare commands")
     flags.add_argument("--bus", help="socketcan:can0,can1,can2,can3, udp_multicast:PORT or unix:FOLDER")
-    flags.add_argument("--rate", type=int, choices=(480, 500), help="ticks a second (default: of deploy.yaml)")
+    flags.add_argument("--rate", type=int, choices=RATES, help="ticks a second (default: of deploy.yaml)")
     flags.add_argument("--dry-run", action="store_true", help="compute commands, and keep the motors off")
     flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
     flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
@@ -44,6 +46,8 @@ def parser() -> argparse.ArgumentParser:
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command; exits with 1 if a check fails, and with 2 and one line if the input is invalid."""
     options = parser().parse_args(args)
+    sys.stdin = sys.stdin or Path(os.devnull).open()  # None: closed
+    logging.getLogger("can.bus").setLevel(logging.ERROR)  # after an error, buses are closed with the process
     try:
         bundle = Bundle(options.bundle)
         if bundle.edited:
@@ -59,7 +63,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if not options.bus:
             raise InputError("--bus, --check or --replay is needed")
         run(bundle, options)
-    except InputError as error:
+    except (InputError, OSError) as error:
         print(f"jumper deploy: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 
@@ -73,33 +77,37 @@ DEMO = (
 
 def run(bundle: Bundle, options: argparse.Namespace) -> None:
     """Run the robot until the operator quits (Ctrl-C) or the time is over, then brake and switch the motors off."""
-    rate = options.rate or int(bundle.settings["rate"])
-    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
+    rate = options.rate or bundle.settings.get("rate")
+    if rate not in RATES or not options.seconds > 0.0:
+        raise InputError(f"the rate must be 480 or 500 Hz and seconds above 0, got {rate} and {options.seconds}")
     pump = (lambda: None) if options.lockstep else None
-    link = Link(open_buses(options.bus), reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
-    source = MotionCapture() if options.capture else None
-    runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    with bundle.reading():
+        link = Link([], reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
+        source = MotionCapture() if options.capture else None
+        runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
+    link.buses = open_buses(options.bus)
+    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
     if log is not None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Keyboard(options.height, options.place)
     script = {round(at * rate): (request, values) for at, request, values in DEMO}
-    ticks, last = itertools.count(), State.PASSIVE
+    ticks, last = itertools.count(), (State.PASSIVE, 0)
 
     def tick(late: float) -> None:
-        """Run a tick with the operator's request, and print changes of the state."""
+        """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""
         nonlocal last
         runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
         if dog is not None:
             dog.beat()
-        if runtime.state != last:
-            last = runtime.state
-            print(f"{last.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
+        if (runtime.state, runtime.reason) != last:
+            last = (runtime.state, runtime.reason)
+            print(f"{runtime.state.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
 
     try:
         with raw_terminal():
             if options.lockstep:
-                for _ in range(round(options.seconds * rate)):
+                for _ in itertools.takewhile(lambda number: number < options.seconds * rate, itertools.count()):
                     tick(0.0)
             else:
                 request_real_time()

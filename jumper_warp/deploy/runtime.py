@@ -33,6 +33,7 @@ SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
 JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
 DRIVERLESS = (State.PASSIVE, State.DAMP, State.LANDING)  # states that a fault does not end
+RATES = (480, 500)  # [Hz] ticks a second
 ENTER_TICKS = 5  # in each of which the motors are switched on, since a frame can be lost
 REST_TICKS = 96  # over which the readings of a robot at rest are averaged
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
@@ -178,8 +179,8 @@ class Runtime:
             frames[self.bundle.joints.motor[int(values[0])]] = np.frombuffer(ZERO, np.uint8)
             self._rest_ticks = 0
             return frames
-        if request == Request.STAND and self.ready:
-            self.reason = self.safety.fault
+        if request == Request.STAND:
+            self.reason = self.safety.fault if self.ready else Fault.SILENT
             if not self.reason:
                 self._enter(State.STAND_UP)
                 self._enter_ticks = ENTER_TICKS

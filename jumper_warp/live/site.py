@@ -86,9 +86,11 @@ def write_page(folder: Path, policies: Sequence[Policy] = ()) -> Path:
     """Write the static page with its policies to a folder, and return the path of its index.html.
 
     policies: take the place of the project's policies of their skills, in all scenes. Raises InputError: the bundle is
-    missing; PolicyError: see `browser_files`.
+    missing, or two policies have the same skill; PolicyError: see `browser_files`.
     """
     own = {skill_of(policy): policy for policy in policies}
+    if len(own) < len(policies):
+        raise InputError("the page takes one policy for each skill")
     scenes = {scene: names | {skill: f"my_{skill}" for skill in own} for scene, names in SCENES.items()}
     used: Mapping[str, Any] = {f"my_{skill}": policy for skill, policy in own.items()}
     with as_file(files("jumper_warp.live").joinpath("page", "dist")) as bundle:

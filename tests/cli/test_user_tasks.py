@@ -235,3 +235,15 @@ def test_error_in_a_users_file_prints_one_line(command, right, wrong, message, t
         sys.modules.pop("own_faults", None)
     lines = [row for row in err if row.startswith("jumper:")]
     assert code == 2 and len(lines) == 1 and message.format(line=line, use=use) in lines[0]
+
+
+@pytest.mark.parametrize("args", [["try"], ["rescore", "none.rrd", "--task"], ["compare", "--file"]])
+def test_error_in_a_file_that_a_command_names_prints_one_line(args, tmp_path, capsys):
+    file = tmp_path / "file_of_a_command.py"
+    file.write_text("import not_there\n")
+    if args[0] == "compare":
+        (tmp_path / "arms.toml").write_text(f'seeds = [1]\nmodules = ["{file.name}"]\n[arms]\nbase = "--seed 1"\n')
+        file = tmp_path / "arms.toml"
+    code, _, err = run(capsys, *args, str(file))
+    message = "jumper: file_of_a_command.py:1: ModuleNotFoundError: No module named 'not_there'"
+    assert code == 2 and [row for row in err if row.startswith("jumper:")] == [message]

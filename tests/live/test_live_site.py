@@ -9,6 +9,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.live import site
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.utils.errors import InputError
 
 
 def test_exported_policy_has_all_weights_and_the_interface(tmp_path):
@@ -50,3 +51,8 @@ def test_own_policies_take_the_place_of_their_skills(tmp_path, monkeypatch):
     assert scenes == {"plain": site.EARTH | {"walk": "my_walk"}}
     description = json.loads((tmp_path / "out" / "policies" / "my_walk" / "policy.json").read_text())
     assert description["interface"]["task"] == "velocity-rough"
+
+
+def test_page_refuses_two_policies_of_a_skill(tmp_path):
+    with pytest.raises(InputError, match="one policy for each skill"):
+        site.write_page(tmp_path, [Policy.load("vertical_jump"), Policy.load("mars_vertical_jump")])

@@ -1,0 +1,212 @@
+"""`jumper deploy` and exports for it: wrong settings and flags, damaged logs, a far end that stops."""
+
+import errno
+import json
+import shutil
+import threading
+
+import can
+import numpy as np
+import pytest
+import yaml
+
+from jumper_warp.cli.bus_sim import run as bus_sim
+from jumper_warp.cli.export import run as export
+from jumper_warp.deploy import bus, main
+from jumper_warp.deploy.bundle import FILE, Bundle
+from jumper_warp.deploy.check import check_bundle
+from jumper_warp.deploy.log import read_log
+from jumper_warp.deploy.runtime import TICK
+from jumper_warp.utils.errors import InputError
+
+
+def refusal(capsys, *args):
+    """Run the command, which must exit with code 2, and return its line on standard error."""
+    with pytest.raises(SystemExit) as end:
+        main.main([str(arg) for arg in args])
+    assert end.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"- 1\n", b"a: [1,\n", b"version: 1\n", bytes(range(256))],
+    ids=["no", "list", "cut", "short", "bytes"],
+)
+def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    (folder / FILE).write_bytes(text)
+    with pytest.raises(InputError, match=r"deploy\.yaml"):
+        Bundle(folder)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("joint_ids_map",), [0, 1, 2]), (("joint_offsets",), [float("nan")] * 12), (("hold", "damping"), [1.0, 2.0]),
+        (("torque_curve",), {}), (("policies",), []), (("files",), None), (("estimator",), None), (("safety",), {}),
+        (("policies", "vertical_jump", "stiffness"), [1.0, 2.0]), (("policies", "vertical_jump", "commands"), None),
+        (("safety", "damping"), []), (("policies", "vertical_jump", "observations", "angle", "scale"), []),
+        (("policies", "vertical_jump", "actions", "JointPositionAction", "scale"), [1.0, 2.0]),
+        (("policies", "vertical_jump", "command_filter"), {}), (("policies", "vertical_jump", "skill"), "fly"),
+    ],
+    ids=lambda x: x[-1] if isinstance(x, tuple) else "",
+)  # fmt: skip
+def test_wrong_setting_is_refused_by_the_check(place, value, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    section = settings
+    for name in place[:-1]:
+        section = section[name]
+    section[place[-1]] = value
+    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+    with pytest.raises(InputError, match=r"deploy\.yaml"):
+        check_bundle(Bundle(folder))
+
+
+@pytest.mark.parametrize("rate", [0, -480, "abc", 1000])
+def test_wrong_rate_is_refused(rate, bundle_folder, tmp_path, capsys):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    (folder / FILE).write_text(yaml.safe_dump(settings | {"rate": rate}, sort_keys=False))
+    assert "rate must be" in refusal(capsys, folder, "--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
+
+
+@pytest.mark.parametrize("seconds", [0, -1, "nan"])
+def test_wrong_time_is_refused(seconds, bundle_folder, tmp_path, capsys):
+    assert "seconds above 0" in refusal(capsys, bundle_folder, "--bus", f"unix:{tmp_path}/bus", f"--seconds={seconds}")
+
+
+def test_bus_without_a_folder_is_refused(bundle_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert "bus must be" in refusal(capsys, bundle_folder, "--bus", "unix:", "--seconds", 0.01)
+    assert not list(tmp_path.iterdir())
+
+
+def test_log_that_exists_is_kept(bundle_folder, tmp_path, capsys):
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "ticks.bin").write_bytes(b"recorded")
+    args = ("--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01, "--log", tmp_path / "log")
+    assert "File exists" in refusal(capsys, bundle_folder, *args)
+    assert [path.name for path in (tmp_path / "log").iterdir()] == ["ticks.bin"]
+    assert (tmp_path / "log" / "ticks.bin").read_bytes() == b"recorded"
+
+
+@pytest.fixture
+def silent_robot(tmp_path):
+    """Function that answers some ticks of a runtime in lockstep, without frames, and returns the buses."""
+    spec = f"unix:{tmp_path}/bus"
+    far = bus.open_buses(spec, "robot")
+    threads = []
+
+    def answer(ticks):
+        """End the frames of each tick."""
+        for _ in range(ticks):
+            for each in far:
+                while each.recv(20.0).arbitration_id != bus.SYNC:
+                    pass
+                each.send(bus.data_frame(bus.SYNC, b""))
+
+    def start(ticks):
+        """Answer in the background."""
+        threads.append(threading.Thread(target=answer, args=(ticks,)))
+        threads[0].start()
+        return spec
+
+    yield start
+    threads[0].join()
+    for each in far:
+        each.shutdown()
+
+
+def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, silent_robot, monkeypatch, capsys):
+    monkeypatch.setattr(bus, "LOCKSTEP_TIMEOUT", 0.3)
+    assert "no frames in lockstep" in refusal(capsys, bundle_folder, "--bus", silent_robot(3), "--lockstep")
+
+
+def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot, capsys):
+    """No motor replies, so that the request to stand is refused."""
+    ticks = 300 + 480 + 4  # of the run, and of its end
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
+    assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
+
+
+def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp_path, monkeypatch, capsys):
+    """The third write of a frame fails."""
+    written = []
+
+    class Full:
+        """Logger on a disk for two frames."""
+
+        def __init__(self, path):
+            self.path = path
+
+        def __call__(self, message):
+            """Write, or fail."""
+            written.append(message)
+            if len(written) > 2:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        def stop(self):
+            """Do nothing."""
+
+    monkeypatch.setattr(can, "Logger", Full)
+    ticks = 300 + 480 + 4  # of the run, and of its end
+    args = ["--demo", "--lockstep", "--seconds", str(300 / 480), "--log", str(tmp_path / "log")]
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), *args])
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == ["PASSIVE SILENT"]
+    assert printed.err.count("the log ends, the robot continues") == 1 and len(written) == 3
+
+
+ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsize}
+
+
+@pytest.mark.parametrize(
+    ("about", "ticks"),
+    [
+        ([1], 3), (ABOUT | {"rate": 0}, 3), (ABOUT | {"rate": "x"}, 3), ({"version": 1}, 3), (ABOUT, 0),
+        (ABOUT | {"capture": None}, 3), (ABOUT, -3),
+    ],
+)  # fmt: skip
+def test_damaged_log_is_refused(about, ticks, tmp_path):
+    """A negative number of ticks: they have a request that does not exist."""
+    records = np.zeros(abs(ticks), TICK)
+    records["request"] = 0 if ticks >= 0 else -90
+    (tmp_path / "log.json").write_text(json.dumps(about))
+    (tmp_path / "ticks.bin").write_bytes(records.tobytes())
+    with pytest.raises(InputError, match="damaged"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [["--bundle", "--page", "p"], ["--bundle", "--blend", "vertical_jump", "0.5"], ["--page", "p", "--out", "q"]],
+)
+def test_flags_of_two_exports_are_refused(flags, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="exclude each other"):
+        export(["vertical_jump", *flags])
+    assert not list(tmp_path.iterdir())
+
+
+def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    (folder / "jumper.dbc").write_text("changed")
+    with pytest.raises(InputError, match="overwrite replaces it"):
+        export(["vertical_jump", "--bundle", "--out", str(folder)])
+    export(["vertical_jump", "--bundle", "--out", str(folder), "--overwrite"])
+    assert check_bundle(Bundle(folder)) == []
+    assert (folder / "jumper.dbc").read_bytes() == (bundle_folder / "jumper.dbc").read_bytes()
+
+
+@pytest.mark.parametrize("flag", [("--rate", "0"), ("--seed", "-1")])
+def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
+    with pytest.raises(InputError, match=flag[0].strip("-")):
+        bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])
+
+
+def test_closed_standard_input_is_no_terminal(bundle_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", None)
+    main.main([str(bundle_folder), "--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"])
+    assert '"ticks"' in capsys.readouterr().out
