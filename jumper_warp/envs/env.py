@@ -127,11 +127,11 @@ class Env(Stages):
         self.seed = seed
         self.auto_reset = auto_reset
         self.handovers = tuple(handovers)
+        check_type("robot (see load_overlay)", robot, RobotOverlay | Sequence[RobotOverlay] | None)
         self.robots = [] if robot is None else [robot] if isinstance(robot, RobotOverlay) else list(robot)
         self.overlay = self.robots[0] if self.robots else None
         self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        check_type("robot (see load_overlay)", self.overlay, RobotOverlay | None)
         own = [with_own_ranges(each, self.overlay) if randomize else each for each in tasks]
         run = [each.in_conditions(randomize=randomize, noise=noise, ground_may_vary=may_vary) for each in own]
         self._draws_ground = any(each.draws_ground for each in run)

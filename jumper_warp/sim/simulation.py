@@ -438,10 +438,10 @@ def _values_of(
     """
     if robot is None or isinstance(robot, RobotValues):
         return robot
+    check_type("robot (see load_overlay)", robot, RobotOverlay | Sequence[RobotOverlay])
     robots = [robot] if isinstance(robot, RobotOverlay) else list(robot)
     each = []
     for one in robots:
-        check_type("robot (see load_overlay)", one, RobotOverlay)
         values = one.robots()
         if "paw_friction" not in one.values:
             values.paw_friction[:] = friction

@@ -291,7 +291,7 @@ def test_standing_has_the_same_pose_and_reward_on_both_solvers():
         (lambda: RewardTerm(my_own_term, 1.0, scale=1.0, width=1.0), "unknown parameter 'width'"),
         (lambda: RewardTerm(my_own_term, 1.0), "parameter 'scale' is missing"),
         (lambda: dataclasses.replace(TASK.levels[0], goal_upper=(0.0, 0.0, 0.1)), "must be finite and rise"),
-        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "must be RobotOverlay or None, got 'robot.json'"),
+        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "RobotOverlay or None, got 'robot.json'"),
         (lambda: Env(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
     ],
 )

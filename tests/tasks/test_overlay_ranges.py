@@ -22,12 +22,13 @@ BY_MOTOR = tuple(0.04 + 0.005 * motor for motor in range(12))  # [N m]
 VALUES = {
     "base_mass": (8.0,), "base_com": (0.02, 0.01, 0.03), "base_inertia": (1.2,), "link_mass": (1.1, 1.2, 0.9, 1.0, 0.8),
     "armature": 12 * (0.006,), "motor_friction": BY_MOTOR, "kp": 12 * (0.8,), "kd": 12 * (1.3,),
-    "saturation": 12 * (0.85,), "no_load_speed": 12 * (44.0,), "cutoff_speed": 12 * (20.0,), "offset": 12 * (0.03,),
+    "saturation": 12 * (0.85,), "peak": 12 * (0.9,), "no_load_speed": 12 * (44.0,), "cutoff_speed": 12 * (20.0,),
+    "offset": 12 * (0.03,),
     "knee_damping": (0.2,), "paw_friction": (0.6,), "latency": (0.025,), "spring_stiffness": (500.0,),
     "spring_length": (0.2,),
 }  # fmt: skip
 """A value of every quantity, other than the described one."""
-NOT_DRAWN = ("base_inertia", "saturation", "knee_damping", "spring_stiffness", "spring_length")
+NOT_DRAWN = ("base_inertia", "saturation", "peak", "knee_damping", "spring_stiffness", "spring_length")
 ROWS = {
     "base_mass": (("base_mass",), ("base_mass",), (-0.3, 0.1)),
     "base_com": (("com_shift",), ("com_shift",), (0.0, 0.01)),
