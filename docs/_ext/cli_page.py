@@ -99,7 +99,7 @@ def summary() -> str:
         "evaluate": "evaluate-policy",
         "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name",
         "compare": "compare-a-b", "rescore": "rescore-recording", "sweep": "sweep-file", "try": "try-file",
-        "deploy": "deploy-bundle",
+        "deploy": "deploy-bundle", "robot": "robot-new-folder",
     }  # fmt: skip
     rows = [
         f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()
