@@ -30,8 +30,8 @@ ROBOT is a folder, a robot.json, an overlay, or one of the project's robots: {na
 class NewCfg:
     """Write the folder of a robot: robot.json with all its quantities, to edit."""
 
-    folder: tyro.conf.Positional[Path]  # Folder to write to
-    source: Annotated[str, tyro.conf.arg(name="from")] = "jumper"
+    out: tyro.conf.Positional[Path]  # Folder to write to
+    like: Annotated[str, tyro.conf.arg(name="from")] = "jumper"
     """Robot to copy: jumper, another ROBOT, or a URDF with loop_closures.yaml beside it."""
 
 
@@ -81,15 +81,15 @@ def new(cfg: NewCfg) -> None:
     from jumper_warp.robot.folder import FILE, read_urdf, table_of, write_robot
     from jumper_warp.robot.values import described
 
-    if (cfg.folder / FILE).exists():
-        raise UsageError(f"{cfg.folder / FILE} exists")
-    if Path(cfg.source).suffix == ".urdf":
-        table = table_of(read_urdf(Path(cfg.source)), cfg.source)
+    if (cfg.out / FILE).exists():
+        raise UsageError(f"{cfg.out / FILE} exists")
+    if Path(cfg.like).suffix == ".urdf":
+        table = table_of(read_urdf(Path(cfg.like)), cfg.like)
     else:
-        robot = robot_at(cfg.source)
+        robot = robot_at(cfg.like)
         table = robot.robot if robot.robot and not robot.values else None
-        table = table or table_of(described(robot.robots(), robot.description), cfg.source)
-    print(write_robot(cfg.folder, {**table, "name": cfg.folder.name}))
+        table = table or table_of(described(robot.robots(), robot.description), cfg.like)
+    print(write_robot(cfg.out, {**table, "name": cfg.out.name}))
 
 
 def check(cfg: CheckCfg) -> Path:

@@ -27,10 +27,10 @@ class GradientCheck:
         self._differences: list[np.ndarray] = []
 
     def every(self, count: int) -> None:
-        """Add the first and every `count`-th later step of the calls, and end the gradients of all steps."""
+        """Add every `count`-th step of the calls, and end the gradients of all steps."""
+        self._steps += 1
         if self._steps % count == 0:
             self.update()
-        self._steps += 1
         self._gradients.restart()
 
     def update(self) -> None:

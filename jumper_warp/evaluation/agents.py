@@ -155,7 +155,8 @@ def play_agent(task: TaskCfg, cfg: AgentCfg) -> Path:
         env.reset()
         with env.gradients() as gradients:
             check = GradientCheck(gradients)
-            run_evaluation(act, env, log, on_step=lambda: (recorder(), check.every(10)))
+            every = min(10, round(cfg.seconds / env.step_dt))
+            run_evaluation(act, env, log, on_step=lambda: (recorder(), check.every(every)))
         print_gradients(check)
     else:
         run_evaluation(act, env, log, on_step=recorder)

@@ -120,7 +120,7 @@ def _described_motor(motor: Motor, value: Mapping[str, float]) -> Motor:
     jumping, walking = (Gains(value["kp"] * pd.kp, value["kd"] * pd.kd) for pd in (motor.jumping, motor.walking))
     return replace(
         motor,
-        rotor_inertia=value["armature"] / motor.gear_ratio**2,
+        rotor_inertia=motor.rotor_inertia * ratio(value["armature"], motor.armature),
         coulomb_friction=value["motor_friction"],
         peak_torque=value["peak"] * motor.peak_torque,
         no_load_speed=value["no_load_speed"],
