@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.jumps import DELAY, JumpLog, JumpOutcome, random_headings
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, JumpLog, JumpOutcome, random_headings
 from jumper_warp.evaluation.log import check, within
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
@@ -22,6 +22,12 @@ JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one j
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
+
+def within_limits(outcome: JumpOutcome) -> np.ndarray:
+    """Return whether the base ends within the authors' limits on drift and turn, bool, shaped as the fields."""
+    return (outcome.drift_m <= DRIFT) & (outcome.turn_deg <= TURN)
+
+
 SUCCESS_METRICS = (
     Metric("success_rate", rate, "jumps", lambda o: o.success),
     Metric("goal_reached_rate", rate, "jumps", lambda o: o.reached),
@@ -30,6 +36,10 @@ SUCCESS_METRICS = (
     Metric("no_paw_lift_rate", rate, "jumps", lambda o: o.still),
     Metric("success_without_paw_lift_rate", rate, "jumps", lambda o: o.success & o.still),
     Metric("success_without_hop_rate", rate, "jumps", lambda o: o.success & ~o.hopped),
+    Metric("stance_height_mean_m", mean, "jumps", lambda o: o.stance_m),
+    Metric("squat_height_mean_m", mean, "jumps", lambda o: o.squat_m),
+    Metric("height_at_end_mean_m", mean, "landed jumps", lambda o: o.height_at_end_m),
+    Metric("transversal_angle_max_deg", largest, "jumps that did not diverge", lambda o: o.transversal_deg),
 )
 """Table of the rates of successful jumps and of the parts of a success; `JumpOutcome` defines their events."""
 FAILURE_METRICS = (
@@ -55,12 +65,14 @@ HEIGHT_METRICS = (
     Metric("apex_max_m", largest, "jumps that did not diverge", lambda o: o.apex_m),
     Metric("drift_mean_m", mean, "landed jumps", lambda o: o.drift_m),
     Metric("drift_max_m", largest, "landed jumps", lambda o: o.drift_m),
-    Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: (o.drift_m > DRIFT) | (o.turn_deg > TURN)),
+    Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: ~within_limits(o)),
+    Metric("success_within_authors_limits_rate", rate, "jumps", lambda o: o.success & within_limits(o)),
     *FAILURE_METRICS,
 )
 """Table of the metrics of jumps to heights; the authors' limits on drift and turn are DRIFT and TURN."""
 PLACE_METRICS = (
     *SUCCESS_METRICS,
+    Metric("success_at_touchdown_rate", rate, "jumps", lambda o: o.success & (o.distance_at_touchdown_m <= TOLERANCE)),
     Metric("goal_distance_at_rest_mean_m", mean, "landed jumps", lambda o: o.distance_at_rest_m),
     Metric("goal_distance_at_touchdown_mean_m", mean, "jumps that touched down", lambda o: o.distance_at_touchdown_m),
     Metric("goal_distance_at_end_mean_m", mean, "jumps that did not diverge", lambda o: o.distance_at_end_m),
@@ -102,9 +114,12 @@ class JumpFlags:
     num_jumps: int = 200  # Number of jumps
     success_range: tuple[float, float] = field(default=PlaceEvaluation.success_range, kw_only=True)
     """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
+    hold: float = field(default=REST_TIME, kw_only=True)
+    """[s] Time after touchdown until which nothing but the paws may touch anything."""
 
     def __post_init__(self) -> None:
-        """Raise InputError for no jumps, or a range of successful goals that does not rise."""
+        """Raise InputError for no jumps, a range of successful goals that does not rise, or a time out of range."""
+        check(REST_TIME <= self.hold <= 60.0, f"hold must be in [{REST_TIME:g}, 60] s, got {self.hold}")
         check(self.num_jumps >= 1, f"num_jumps must be at least 1, got {self.num_jumps}")
         low, high = self.success_range
         check(0.0 <= low <= high < 10.0, f"success_range must be in [0, 10) m and rise, got {self.success_range}")
@@ -132,7 +147,7 @@ class HeightFlags(JumpFlags):
 
     def log(self, task: TaskCfg, seed: int) -> JumpLog:
         """Return a new log of one jump per world to evenly spaced heights; seed has no effect."""
-        return JumpLog(np.linspace(*self.height_range, self.num_jumps), task.termination_names)
+        return JumpLog(np.linspace(*self.height_range, self.num_jumps), task.termination_names, rest=self.hold)
 
 
 @dataclass(frozen=True)
@@ -179,7 +194,7 @@ class LandingFlags(JumpFlags):
         rng = np.random.default_rng(seed)
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return JumpLog(goals[:, None], task.termination_names, headings, self.delay)
+        return JumpLog(goals[:, None], task.termination_names, headings, self.delay, self.hold)
 
 
 @dataclass(frozen=True)

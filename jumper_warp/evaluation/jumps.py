@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, FALLS, NO_END, SUCCESS, EvaluationLog, check, listed
+from jumper_warp.sim.simulation import motor_values
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.rotations import turn_plane, yaw_of
@@ -97,6 +98,10 @@ class JumpOutcome:
     paw_to_paw_distance_m: np.ndarray  # Horizontal, from the paws at takeoff to those at touchdown, mean of four
     tilt_deg: np.ndarray  # Largest tilt since touchdown
     turn_deg: np.ndarray  # Size of the yaw at the end
+    stance_m: np.ndarray  # Base height at the command
+    squat_m: np.ndarray  # Lowest base height from the command to takeoff
+    height_at_end_m: np.ndarray  # Base height at the end
+    transversal_deg: np.ndarray  # Largest angle of a transversal motor in flight
     drift_m: np.ndarray  # Horizontal distance of the base from its start at the end
 
     @property
@@ -164,6 +169,10 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         distance_at_rest_m=distance_at_rest,
         ahead_m=known(ahead),
         left_m=known(left),
+        stance_m=known(jumps.stance),
+        squat_m=known(jumps.squat),
+        height_at_end_m=known(jumps.end_height),
+        transversal_deg=known(np.degrees(jumps.transversal)),
         drift_m=known(jumps.drift),
         distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
         paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
@@ -226,6 +235,10 @@ class JumpLog(EvaluationLog):
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
         self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
+        self.stance = np.full(shape, np.nan)  # [m] base height at the command
+        self.squat = np.full(shape, np.nan)  # [m] lowest base height from the command to takeoff
+        self.end_height = np.full(shape, np.nan)  # [m] base height at the end
+        self.transversal = np.full(shape, np.nan)  # [rad] largest angle of a transversal motor in flight
         self.apex = np.full(shape, np.nan)  # [m] largest base height in flight; before takeoff the current one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
         self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
@@ -254,8 +267,9 @@ class JumpLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the task's arrays and, from `paw_arrays`, paw contacts, paw positions and the base's upward speed."""
-        return env.task_arrays() | paw_arrays(env)
+        """Return the task's arrays, those of `paw_arrays`, and `transversal`: largest such motor angle [rad]."""
+        angles = motor_values(env.sim.joint_q()[:, 7:]).reshape(-1, 4, 3)
+        return env.task_arrays() | paw_arrays(env) | {"transversal": angles[..., 1:].max(axis=(1, 2))}
 
     def record_step(self, env: Env) -> bool:
         """Record a policy step, and command the next jump where one has ended; return whether all have ended."""
@@ -286,6 +300,7 @@ class JumpLog(EvaluationLog):
         landed = jump["phase"] == LANDED
         self.tilt[at] = jump["peak_tilt"]
         self.apex[at] = updated_apex(self.apex[at], jump)
+        self._record_heights(jump, at)
         self._record_landing(jump, at, landed, step_dt)
         failed = (jump["termination"] >= 0) & (jump["termination"] != self._success)
         rested = ~failed & landed & (jump["phase_steps"] >= round(self.rest / step_dt))
@@ -293,6 +308,17 @@ class JumpLog(EvaluationLog):
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
+
+    def _record_heights(self, jump: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
+        """Record base heights in stance, and the motors' largest angle in flight; arguments as of `_record_landing`."""
+        height = jump["base_pos"][:, 2]
+        waits = (jump["phase"] == STANCE) & (jump["steps"] <= jump["command_step"])
+        prepares = (jump["phase"] == STANCE) & ~waits
+        flies = ~waits & ~prepares & (jump["phase"] != LANDED)
+        self.stance[at] = np.where(waits | np.isnan(self.stance[at]), height, self.stance[at])
+        self.squat[at] = np.where(prepares, np.fmin(self.squat[at], height), self.squat[at])
+        self.end_height[at] = height
+        self.transversal[at] = np.where(flies, np.fmax(self.transversal[at], jump["transversal"]), self.transversal[at])
 
     def _record_landing(
         self, jump: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float

@@ -250,6 +250,7 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
     new.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
     new.max_height = robot.pos[2]
+    new.squat = robot.height
     new.command_step = whole_steps(values[3])
     return new
 

@@ -19,7 +19,7 @@ def make_arrays(jumps, **changes):
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
         "heading": np.zeros(count), "goal": np.zeros((count, 3)), "touched_down": np.zeros(count, dtype=int),
         "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool), "paw_pos": np.zeros((count, 4, 2)),
-        "took_off": np.zeros(count, dtype=int),
+        "took_off": np.zeros(count, dtype=int), "transversal": np.zeros(count),
     }  # fmt: skip
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
@@ -81,6 +81,8 @@ def test_height_metrics_match_hand_computed_values():
         "turn_abs_mean_deg": 18.0,
         "turn_abs_max_deg": 26.0,
         "beyond_authors_limits_rate": 0.5,
+        "success_within_authors_limits_rate": 0.25,
+        "height_at_end_mean_m": 0.3,
         "collision_rate": 0.25,
         "fall_rate": 0.5,
         "miss_rate": 0.0,
@@ -111,3 +113,18 @@ def test_landing_from_wrong_height_counts_as_miss_not_fall():
     jumps.update(make_arrays(jumps, **changes), 1.0 / 60.0)
     metrics = metrics_of(jumps)
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
+
+
+def test_heights_of_stance_squat_and_end_and_the_largest_angle_in_flight():
+    jumps = JumpLog(np.array([0.5]), ("success",), rest=2.0)
+    course = [  # step, phase, height [m], transversal [rad]
+        (29, 0, 0.38, 0.9), (30, 0, 0.36, 1.0), (31, 0, 0.30, 1.9), (32, 0, 0.21, 1.8), (33, 0, 0.4, 1.2),
+        (34, 1, 0.45, 0.5), (35, 1, 0.50, 1.5), (36, 1, 0.42, 1.1), (37, 2, 0.20, 2.2), (38, 2, 0.34, 0.7),
+    ]  # fmt: skip
+    for step, phase, height, angle in course:
+        changes = {"phase": [phase], "base_pos": [[0.0, 0.0, height]], "transversal": [angle], "phase_steps": [step]}
+        jumps.update(make_arrays(jumps, steps=[step], **changes), 1.0 / 60.0)
+    outcome = jumps.outcome
+    heights = (outcome.stance_m, outcome.squat_m, outcome.height_at_end_m)
+    assert [each[0, 0] for each in heights] == [0.36, 0.21, 0.34]
+    assert outcome.transversal_deg[0, 0] == pytest.approx(math.degrees(1.5))

@@ -32,7 +32,9 @@ class StubEnv:
         self.task = SimpleNamespace(contact_force=0.1)
         force = wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu")
         self.robot = SimpleNamespace(paw_pos=wp.zeros((4, count), dtype=wp.vec3, device="cpu"))
-        self.sim = SimpleNamespace(paw_force=force, base_velocity=lambda: self.arrays["base_vel"])
+        self.sim = SimpleNamespace(
+            paw_force=force, base_velocity=lambda: self.arrays["base_vel"], joint_q=lambda: np.zeros((count, 43))
+        )
         self.arrays = {
             "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
             "base_pos": np.zeros((count, 3)),
@@ -117,6 +119,11 @@ def test_landing_metrics_match_hand_computed_values():
         "distance_flown_mean_m": None,
         "paw_to_paw_distance_mean_m": None,
         "success_rate": 1 / 5,
+        "success_at_touchdown_rate": 0.0,
+        "stance_height_mean_m": 0.2,
+        "squat_height_mean_m": 0.0,
+        "height_at_end_mean_m": 0.3,
+        "transversal_angle_max_deg": 0.0,
         "goal_reached_rate": 1 / 5,
         "landed_rate": 2 / 5,
         "at_rest_rate": 1 / 5,
