@@ -31,7 +31,7 @@ REWARDS = (
     RewardTerm(rewards.orientation, 15.0, std=0.15, waiting_scale=0.1),
     RewardTerm(rewards.flight_angular_velocity, 4.0, std=10.0),
     RewardTerm(rewards.left_right_symmetry, 20.0, std=0.5, waiting_scale=0.1),
-    RewardTerm(rewards.standing_posture, 50.0, std=20.0 * DEG, shift=25.0 * DEG),
+    RewardTerm(rewards.standing_posture, 200.0, std=30.0 * DEG, shift=12.0 * DEG),
     RewardTerm(rewards.base_at_rest, 40.0, std_lin_vel=0.1, std_ang_vel=0.5),
     RewardTerm(rewards.landing_tilt, -60.0, angle=10.0 * DEG),
     RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG),
@@ -49,9 +49,10 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
+    TerminationTerm(terminations.landed_for, name="success", steps=3.0 * SECOND, time_out=True, success=True),
     TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.early_takeoff),
+    TerminationTerm(terminations.crouched, height=0.28, steps=1.5 * SECOND),
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
     TerminationTerm(terminations.missed_goal, tolerance=0.50),
     TerminationTerm(terminations.turned_touchdown, rotation=20.0 * DEG, yaw=10.0 * DEG),
@@ -69,9 +70,11 @@ NEXT_JUMP_PROBABILITY = 0.175  # [1] of another goal after a landing, above the 
 
 RESET = ResetCfg(
     start_probability=StartProbability(
-        standing=0.40, default=0.15, in_flight=0.15, touchdown=0.15, after_landing=0.05, pushing=0.10
+        standing=0.30, default=0.15, in_flight=0.15, touchdown=0.10, after_landing=0.20, pushing=0.10
     ),
     balance_by="steps",
+    long_wait_probability=0.3,
+    long_wait=4.0,
     forward_pitch=10.0,
     lean=0.20,
     heading=180.0,
