@@ -6,6 +6,7 @@ follows once the robot rests after landing.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -71,7 +72,7 @@ class Motion:
         }  # fmt: skip
 
 
-class Skill:
+class Skill(ABC):
     """A policy with its gains; `targets` returns the filtered targets of a policy step."""
 
     def __init__(self, policy: DeployedPolicy, gains: Gains, ranges: Mapping[str, Any]) -> None:
@@ -95,9 +96,9 @@ class Skill:
         target = self.policy.default + self.policy.scale * action
         return self.policy.filter_targets(target, motion.q, motion.qd)
 
+    @abstractmethod
     def command(self, motion: Motion) -> dict[str, Any]:
         """Return the readings of the command."""
-        raise NotImplementedError
 
 
 class Walk(Skill):

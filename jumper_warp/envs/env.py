@@ -30,7 +30,7 @@ from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
-from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.robot.overlay import RobotOverlay, robots_of
 from jumper_warp.sim.dynamics import WorldRange, advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
 from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg, checked_tasks
@@ -38,7 +38,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of, with_own_ranges
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
-from jumper_warp.utils.checks import check_count, check_flags, check_seed, check_type
+from jumper_warp.utils.checks import check_count, check_flags, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, loading_kernels, records
@@ -127,8 +127,7 @@ class Env(Stages):
         self.seed = seed
         self.auto_reset = auto_reset
         self.handovers = tuple(handovers)
-        check_type("robot (see load_overlay)", robot, RobotOverlay | Sequence[RobotOverlay] | None)
-        self.robots = [] if robot is None else [robot] if isinstance(robot, RobotOverlay) else list(robot)
+        self.robots = robots_of(robot)
         self.overlay = self.robots[0] if self.robots else None
         self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None

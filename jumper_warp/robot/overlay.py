@@ -9,7 +9,7 @@ import copy
 import functools
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from jumper_warp.robot.folder import SCHEMA as ROBOT_SCHEMA
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import ASSETS
-from jumper_warp.utils.checks import check_types
+from jumper_warp.utils.checks import check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_json, write_atomically
 
@@ -217,6 +217,14 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
     Raises InputError: one of them is out of range.
     """
     return RobotOverlay({"spring_stiffness": (float(stiffness),), "spring_length": (float(length),)}, source="springs")
+
+
+def robots_of(robot: RobotOverlay | Sequence[RobotOverlay] | None) -> list[RobotOverlay]:
+    """Return the robots of an argument `robot`, which worlds take in turn. Raises InputError: of another type."""
+    check_type("robot (see load_overlay)", robot, RobotOverlay | Sequence[RobotOverlay] | None)
+    if robot is None:
+        return []
+    return [robot] if isinstance(robot, RobotOverlay) else list(robot)
 
 
 def load_overlay(path: Path) -> RobotOverlay:

@@ -20,7 +20,7 @@ from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
-from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.robot.overlay import RobotOverlay, robots_of
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import (
     TOLERANCE,
@@ -34,7 +34,7 @@ from jumper_warp.sim.dynamics import (
 from jumper_warp.sim.mujoco import MujocoDynamics
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_count, check_flags, check_type
+from jumper_warp.utils.checks import check_count, check_flags
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel
@@ -438,10 +438,8 @@ def _values_of(
     """
     if robot is None or isinstance(robot, RobotValues):
         return robot
-    check_type("robot (see load_overlay)", robot, RobotOverlay | Sequence[RobotOverlay])
-    robots = [robot] if isinstance(robot, RobotOverlay) else list(robot)
     each = []
-    for one in robots:
+    for one in robots_of(robot):
         values = one.robots()
         if "paw_friction" not in one.values:
             values.paw_friction[:] = friction
@@ -456,7 +454,7 @@ def _descriptions_of(robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues 
     """Return the descriptions of the robots that worlds take in turn."""
     if robot is None or isinstance(robot, RobotValues):
         return [load_description()]
-    return [one.description for one in ([robot] if isinstance(robot, RobotOverlay) else robot)]
+    return [one.description for one in robots_of(robot)]
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:
