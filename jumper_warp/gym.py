@@ -9,9 +9,16 @@ import gymnasium
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.robot.overlay import robots_of
+from jumper_warp.tasks.cfg import TaskCfg
 
 ADAPTER = ("all_groups", "tensors", "autoreset_mode", "render_mode", "render_size", "render_envs")
 """Arguments of `GymVectorEnv`."""
+
+
+def _task(name: str, arguments: dict[str, Any]) -> TaskCfg:
+    """Return the task of a name for the robot among an environment's arguments, the first of several."""
+    return make_task(name, next(iter(robots_of(arguments.get("robot"))), None))
 
 
 def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVectorEnv:
@@ -21,7 +28,7 @@ def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVector
     Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
     adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
-    return GymVectorEnv(Env(make_task(task, arguments.get("robot")), num_envs, **arguments), **adapter)
+    return GymVectorEnv(Env(_task(task, arguments), num_envs, **arguments), **adapter)
 
 
 def make_env(task: str, **arguments: Any) -> GymEnv:
@@ -30,7 +37,7 @@ def make_env(task: str, **arguments: Any) -> GymEnv:
     Raises InputError: an unknown task, or arguments that `Env` or `GymEnv` refuses.
     """
     adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
-    return GymEnv(Env(make_task(task, arguments.get("robot")), 1, **arguments), **adapter)
+    return GymEnv(Env(_task(task, arguments), 1, **arguments), **adapter)
 
 
 def env_id(task: str) -> str:

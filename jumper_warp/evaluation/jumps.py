@@ -314,7 +314,7 @@ class JumpLog(EvaluationLog):
         height = jump["base_pos"][:, 2]
         waits = (jump["phase"] == STANCE) & (jump["steps"] <= jump["command_step"])
         prepares = (jump["phase"] == STANCE) & ~waits
-        flies = ~waits & ~prepares & (jump["phase"] != LANDED)
+        flies = (jump["phase"] != STANCE) & (jump["phase"] != LANDED)
         self.stance[at] = np.where(waits | np.isnan(self.stance[at]), height, self.stance[at])
         self.squat[at] = np.where(prepares, np.fmin(self.squat[at], height), self.squat[at])
         self.end_height[at] = height

@@ -159,7 +159,7 @@ def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():
 
 
 def test_correct_aim_removes_constant_overshoot():
-    """A policy that observes goals 40 mm too far misses by a quarter of that at most after the correction alone."""
+    """A policy that observes goals 40 mm too far misses a quarter as far, or less, after the correction alone."""
     policy, cfg = Policy.load("horizontal_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]

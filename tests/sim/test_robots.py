@@ -6,10 +6,11 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from jumper_warp.gym import make_vector_env
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.measures import motors_for
 from jumper_warp.robot.motors import jumping_motors
-from jumper_warp.robot.overlay import ROBOTS, load_overlay
+from jumper_warp.robot.overlay import ROBOTS, RobotOverlay, load_overlay
 from jumper_warp.sim.apex import OpenLoopJump
 from jumper_warp.sim.simulation import Simulation
 
@@ -94,3 +95,10 @@ def test_momentum_and_energy_stay_in_flight(robot):
     np.testing.assert_allclose(after[1], before[1], atol=2.0e-3 * np.abs(before[1]).max())
     assert after[2] == pytest.approx(before[2], rel=1.0e-3)
     assert wp.get_device("cpu") == sim.device
+
+
+def test_gymnasium_takes_several_robots_in_turn():
+    robots = [RobotOverlay({"base_mass": (mass,)}) for mass in (7.0, 9.0)]
+    env = make_vector_env("vertical-jump", 3, robot=robots, randomize=False, device="cpu").unwrapped.env
+    masses = env.sim.model.body_mass.numpy().reshape(3, -1)[:, 0]
+    assert masses == pytest.approx([7.0, 9.0, 7.0])
