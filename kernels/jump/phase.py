@@ -72,6 +72,8 @@ def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> Ju
     if t.took_off == 1:
         t.max_height = robot.pos[2]
         t.apex_passed = 0
+    if phase == STANCE:
+        t.squat = wp.where(t.steps <= t.command_step, robot.height, wp.min(state.squat, robot.height))
     t.at_apex = 0
     if phase != STANCE and state.apex_passed == 0:
         t.max_height = wp.max(t.max_height, robot.pos[2])

@@ -120,6 +120,7 @@ def begin_jump(
     state.goal = goal
     state.start = pos
     state.max_height = pos[2]
+    state.squat = pos[2]
     state.command_step = sample_command_step(rng, ranges)
     state.next_jump_delay = ranges.next_jump_delay
     state.next_jump_step = sample_next_jump_step(rng, ranges.next_jump_delay, next_jump_probability)
@@ -127,6 +128,7 @@ def begin_jump(
         state.start = wp.vec3(0.0, 0.0, pos[2])
     if start_mode == PUSHING:
         state.command_step = 0
+        state.squat = 0.0  # before the start, as deep as any
     if start_mode == IN_FLIGHT or start_mode == TOUCHDOWN:
         state.phase = FLIGHT
         state.command_step = 0
@@ -159,6 +161,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
     state.apex_passed = 0
     state.idle_steps = 0
     state.max_height = pos[2]
+    state.squat = pos[2]
     state.peak_tilt = 0.0
     state.paws_landed = 0
     state.next_jump_step = 0

@@ -17,7 +17,7 @@ import warp as wp
 from ..mdp.rewards import phi, posture_offset, psi, square_sum
 from ..mdp.view import RobotView, angle_from_level, base_deceleration
 from .phase import estimated_apex, landing_error_estimate
-from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting
+from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting, wanted_squat
 
 JUST_LANDED_STEPS = wp.constant(18)  # policy steps (0.3 s) after touchdown that count as just landed
 REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which on the robot should rest
@@ -64,6 +64,19 @@ def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp
     if state.at_apex == 0:
         return 0.0
     return height_closeness(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
+
+
+@wp.func
+def squat(
+    robot: RobotView, state: JumpState, std: float, takeoff_height: float, acceleration: float, floor: float
+) -> float:
+    """Reward for a squat as deep as the commanded height needs, given once, at the apex.
+
+    It is phi_std of the difference [m] between the lowest base height before takeoff and `wanted_squat`.
+    """
+    if state.at_apex == 0:
+        return 0.0
+    return phi(state.squat - wanted_squat(robot, state, takeoff_height, acceleration, floor), std)
 
 
 @wp.func

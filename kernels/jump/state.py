@@ -29,6 +29,7 @@ class JumpState:
     at_apex: int  # 1 in the step in which the base begins to fall
     apex_passed: int  # 1 from that step on
     max_height: float  # [m] highest base origin since takeoff, world z
+    squat: float  # [m] lowest base origin above the ground from the command to takeoff; before the command the present
     touchdown_vel: wp.vec3  # [m/s] world, velocity of the base in the step before touchdown
     peak_tilt: float  # [rad] largest angle between body and world z since touchdown
     start_mode: int  # start mode of the episode (`start_states`)
@@ -55,3 +56,16 @@ def commanded(state: JumpState) -> bool:
 def waiting(state: JumpState) -> bool:
     """Return whether the robot is still in stance although a jump is commanded: preparing it, or idle."""
     return state.phase == STANCE and state.steps >= state.command_step
+
+
+@wp.func
+def wanted_squat(
+    robot: RobotView, state: JumpState, takeoff_height: float, acceleration: float, floor: float
+) -> float:
+    """Return the base height [m] from which a constant acceleration gives the speed for the commanded apex.
+
+    With gravity g and the height z above which the base no longer accelerates, `takeoff_height` [m], the speed is
+    v = sqrt(2 g (apex - z)), and the way v^2 / 2a with `acceleration` a [m/s^2]. The result is at least `floor` [m].
+    """
+    rise = wp.max(state.goal[2] - takeoff_height, 0.0)
+    return wp.max(takeoff_height - rise * robot.gravity_magnitude / acceleration, floor)

@@ -9,7 +9,7 @@ import warp as wp
 from ..mdp.durations import whole_steps
 from ..mdp.view import RobotView, angle_from_level, base_deceleration, yaw_of
 from .phase import landing_error_estimate
-from .state import FLIGHT, LANDED, STANCE, JumpState, goal_offset, waiting
+from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting, wanted_squat
 
 
 @wp.func
@@ -107,3 +107,25 @@ def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float)
 def early_takeoff(robot: RobotView, state: JumpState) -> bool:
     """Terminate at a takeoff before the command; else a policy could ignore the command."""
     return state.took_off == 1 and state.steps < state.command_step
+
+
+@wp.func
+def shallow_squat(
+    robot: RobotView, state: JumpState, tolerance: float, takeoff_height: float, acceleration: float, floor: float
+) -> bool:
+    """Terminate at takeoff if the base was never lower than `wanted_squat` plus `tolerance` [m] since the command."""
+    limit = wanted_squat(robot, state, takeoff_height, acceleration, floor) + tolerance
+    return state.took_off == 1 and state.squat > limit
+
+
+@wp.func
+def crouched(robot: RobotView, state: JumpState, height: float, steps: float) -> bool:
+    """Terminate if the base is lower than `height` [m] although the robot has had `steps` policy steps to stand up.
+
+    They count from the start of an episode, until the command, and from touchdown.
+    """
+    if robot.height >= height:
+        return False
+    if state.phase == LANDED:
+        return state.phase_steps > whole_steps(steps)
+    return state.phase == STANCE and not commanded(state) and state.steps > whole_steps(steps)
