@@ -174,6 +174,22 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 
 @wp.func
+def folded_legs(robot: RobotView, state: JumpState, angle: float) -> float:
+    """Penalty of transversal motors beyond `angle` [rad] in flight: sum of the squares of the excess [rad^2].
+
+    A thigh that stands upright beside the body is close to the stop of the knee.
+    """
+    if state.phase != FLIGHT:
+        return 0.0
+    total = float(0.0)
+    for m in range(12):
+        if m % 3 != 0:
+            excess = wp.max(robot.angle[m] - angle, 0.0)
+            total += excess * excess
+    return total
+
+
+@wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
     """Reward for motor angles near the retracted pose in the 0.3 s after touchdown.
 
@@ -195,6 +211,14 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
         return 0.0
     error = wp.length(goal_offset(robot, state))
     return phi(error, std_wide) + fine_weight * phi(error, std_fine)
+
+
+@wp.func
+def touchdown_tracking(robot: RobotView, state: JumpState, std: float) -> float:
+    """Reward for a base close to the goal at touchdown, horizontally, given once: phi_std of the distance [m]."""
+    if state.touched_down == 0:
+        return 0.0
+    return phi(wp.length(goal_offset(robot, state)), std)
 
 
 @wp.func

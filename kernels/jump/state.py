@@ -59,9 +59,7 @@ def waiting(state: JumpState) -> bool:
 
 
 @wp.func
-def wanted_squat(
-    robot: RobotView, state: JumpState, takeoff_height: float, acceleration: float, floor: float
-) -> float:
+def wanted_squat(robot: RobotView, state: JumpState, takeoff_height: float, acceleration: float, floor: float) -> float:
     """Return the base height [m] from which a constant acceleration gives the speed for the commanded apex.
 
     With gravity g and the height z above which the base no longer accelerates, `takeoff_height` [m], the speed is

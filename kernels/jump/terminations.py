@@ -119,13 +119,14 @@ def shallow_squat(
 
 
 @wp.func
-def crouched(robot: RobotView, state: JumpState, height: float, steps: float) -> bool:
-    """Terminate if the base is lower than `height` [m] although the robot has had `steps` policy steps to stand up.
+def crouched(robot: RobotView, state: JumpState, height: float, start_steps: float, landing_steps: float) -> bool:
+    """Terminate if the base is lower than `height` [m] although the robot has had time to stand up.
 
-    They count from the start of an episode, until the command, and from touchdown.
+    It has `start_steps` policy steps from the start of an episode, until the command, and `landing_steps` from
+    touchdown.
     """
     if robot.height >= height:
         return False
     if state.phase == LANDED:
-        return state.phase_steps > whole_steps(steps)
-    return state.phase == STANCE and not commanded(state) and state.steps > whole_steps(steps)
+        return state.phase_steps > whole_steps(landing_steps)
+    return state.phase == STANCE and not commanded(state) and state.steps > whole_steps(start_steps)
