@@ -26,12 +26,12 @@ from jumper_warp.tasks.units import DEG, SECOND, G
 LANDING_HEIGHT = 0.30  # [m] of the base, at which the ballistic estimate ends
 
 REWARDS = (
-    RewardTerm(rewards.tracking, 50.0, std_wide=0.15, std_fine=0.03, fine_weight=0.6),
+    RewardTerm(rewards.tracking, 50.0, std_wide=0.15, std_fine=0.03, fine_weight=1.5),
     RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10, scale_by_dt=False),
     RewardTerm(rewards.estimated_tracking, 100.0, std_middle=0.30, std_wide=0.50, std_fine=0.10, height=LANDING_HEIGHT),
     RewardTerm(rewards.flight_orientation, 20.0, std=10.0 * DEG),
     RewardTerm(rewards.orientation, 15.0, std=0.15, waiting_scale=0.1),
-    RewardTerm(rewards.folded_legs, -200.0, angle=110.0 * DEG),
+    RewardTerm(rewards.folded_legs, -1000.0, angle=110.0 * DEG),
     RewardTerm(rewards.flight_angular_velocity, 4.0, std=10.0),
     RewardTerm(rewards.left_right_symmetry, 10.0, std=0.5, waiting_scale=0.1),
     RewardTerm(rewards.standing_posture, 200.0, std=30.0 * DEG, shift=12.0 * DEG),
@@ -59,6 +59,7 @@ TERMINATIONS = (
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
     TerminationTerm(terminations.missed_goal, tolerance=0.50),
     TerminationTerm(terminations.turned_touchdown, rotation=20.0 * DEG, yaw=10.0 * DEG),
+    TerminationTerm(terminations.restless, speed=0.1, steps=1.0 * SECOND),
     TerminationTerm(terminations.low_touchdown, height=0.25),
     TerminationTerm(mdp_terminations.low_base, height=0.10),
     TerminationTerm(terminations.left_stance, distance=0.30),

@@ -45,8 +45,8 @@ def vertical_jump_mars() -> TaskCfg:
     )
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.05 * FARTHER))
     task = task.with_terms(
-        "terminations", moved_away={"distance": 0.30 * FARTHER}, wrong_height={"tolerance": 0.10 * FARTHER},
-        tilted={"angle": 40.0 * DEG},
+        "terminations", moved_away={"distance": 0.25 * FARTHER}, wrong_height={"tolerance": 0.10 * FARTHER},
+        tilted={"angle": 40.0 * DEG}, turned_touchdown={"rotation": 40.0 * DEG, "yaw": 25.0 * DEG},
     )  # fmt: skip
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
     task = replace(task, terminations=ends)  # a bounce must not end episodes early in training
@@ -57,10 +57,10 @@ def vertical_jump_mars() -> TaskCfg:
     return task.with_terms(
         "rewards",
         jump_height={"std_wide": 0.8},
+        tracking={"std_wide": 0.4, "std_fine": 0.08},
         estimated_jump_height={"weight": 30.0, "std_wide": 0.8},
         angular_velocity={"weight": 10.0, "std": 0.5},
         air_posture={"weight": 70.0},
-        ground_posture={"weight": 20.0},
         joint_symmetry={"weight": 15.0},
     )
 
