@@ -130,9 +130,3 @@ def crouched(robot: RobotView, state: JumpState, height: float, start_steps: flo
     if state.phase == LANDED:
         return state.phase_steps > whole_steps(landing_steps)
     return state.phase == STANCE and not commanded(state) and state.steps > whole_steps(start_steps)
-
-
-@wp.func
-def restless(robot: RobotView, state: JumpState, speed: float, steps: float) -> bool:
-    """Terminate if the base is faster than `speed` [m/s] although at least `steps` policy steps followed touchdown."""
-    return state.phase == LANDED and state.phase_steps >= whole_steps(steps) and wp.length(robot.lin_vel) > speed

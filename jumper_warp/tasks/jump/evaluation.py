@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from jumper_warp.tasks.cfg import TaskCfg
@@ -28,6 +28,8 @@ class JumpEvaluation(Evaluation):
 
     goal_marker: ClassVar[str] = "goal"
     """Field of the state that live views mark: the place and, if it is commanded, the height of the apex."""
+    hold: float = field(default=1.0, compare=False, kw_only=True)
+    """[s] Time after touchdown until which nothing but the paws may touch anything."""
 
     def prepare_task(self, task: TaskCfg) -> TaskCfg:
         """Return a copy of a task that keeps only the terminations for evaluated jumps."""

@@ -33,7 +33,7 @@ QUIET = (
 """Penalties of motion while standing before the command and after the landing."""
 
 REWARDS = (
-    RewardTerm(rewards.jump_height, 120.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, scale_by_dt=False),
+    RewardTerm(rewards.jump_height, 80.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, scale_by_dt=False),
     RewardTerm(rewards.estimated_jump_height, 20.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4),
     RewardTerm(rewards.tracking, 40.0, std_wide=0.15, std_fine=0.03, fine_weight=0.6),
     RewardTerm(rewards.horizontal_velocity, 10.0, speed_scale=0.04, waiting_scale=WAITING_SCALE),
@@ -67,7 +67,6 @@ TERMINATIONS = (
     TerminationTerm(terminations.crouched, height=0.28, start_steps=0.3 * SECOND, landing_steps=1.5 * SECOND),
     TerminationTerm(terminations.wrong_height, tolerance=0.10),
     TerminationTerm(terminations.turned_touchdown, rotation=25.0 * DEG, yaw=15.0 * DEG),
-    TerminationTerm(terminations.restless, speed=0.1, steps=1.0 * SECOND),
     TerminationTerm(terminations.low_touchdown, height=0.20),
     TerminationTerm(mdp_terminations.low_base, height=0.10),
     TerminationTerm(terminations.moved_away, distance=0.25),
@@ -112,5 +111,5 @@ def vertical_jump() -> TaskCfg:
         command_filter=vertical_jump_filter(),
         action_scale=(15.0, 90.0),
         self_collision_margin=0.005,
-        evaluation=HeightEvaluation(),
+        evaluation=HeightEvaluation(hold=5.0),
     )
