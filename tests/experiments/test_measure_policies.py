@@ -106,7 +106,7 @@ def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
     assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "slippery_jump"]
     assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
     assert all((POLICIES.parents[1] / test["command"].split()[0]).is_file() or test["command"].startswith("jumper ")
-               for test in TESTS.values())  # fmt: skip
+               for test in TESTS.values() if "command" in test)  # fmt: skip
 
 
 # ---------------------------------------------------------------- the experiment
