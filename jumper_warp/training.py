@@ -40,14 +40,10 @@ def train(
         cfg = dataclasses.replace(cfg, seeds=tuple(seeds))
     if cfg.ppo.symmetry != "off":
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
-    actor_init = as_rsl_rl = None
+    actor_init = None
     if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
-    if cfg.trainer == "rsl-rl":
-        from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     if cfg.seeds:
         return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
     checkpoint = checkpoints[0] if checkpoints else None
-    return runner.train(
-        cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate, observers
-    )  # fmt: skip
+    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoint, expected_rate, observers)

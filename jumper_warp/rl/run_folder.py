@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
@@ -20,8 +20,6 @@ from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
-AsRslRl = Callable[[VecEnv, int], Any]
-"""Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 SOURCES = "sources"  # Folder in a run's folder that holds copies of the user's files
 
