@@ -21,7 +21,6 @@ from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.sb3 import Sb3VecEnv
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.identification.actuators import Bench
 from jumper_warp.identification.motions import RecordedMotion, load_motions
 from jumper_warp.policies.catalog import ONNX, add_files, read_files, summarise
 from jumper_warp.policies.policy import blend, save_policy
@@ -208,8 +207,6 @@ def test_another_object_in_place_of_an_environment_or_a_model_is_refused(make, n
         (lambda env, model: RecordedMotion("x", TIMES, "targets"), "motion x: target"),
         (lambda env, model: RecordedMotion("x", TIMES, SQUARE, SQUARE + 1j), "motion x: angle"),
         (lambda env, model: RecordedMotion("x", TIMES * 1.0e9, SQUARE, SQUARE), "time rises by 1e\\+09 s a row"),
-        (lambda env, model: Bench(*5 * [ZEROS > 0]), "bench: test"),
-        (lambda env, model: Bench(*5 * ["x"]), "bench: test"),
         (lambda env, model: DeployedPolicy(POLICY / ONNX).act(np.ones(147, dtype=bool)), "observation must be numbers"),
         (lambda env, model: GymVectorEnv(GymVectorEnv(env)), "env must be Env"),
         (lambda env, model: SolverJumper(model).step(3, model.state(), None, None, 0.002), r"state_in\.joint_q must"),
