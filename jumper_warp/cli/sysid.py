@@ -25,7 +25,7 @@ HELP = f"""\
 usage: jumper sysid [fit] DATA ... [flags]
        jumper sysid excite [flags]
 
-  DATA      recorded motions: npz, csv or parquet files, folders of them, or
+  DATA      recorded motions: npz or csv files, folders of them, or
             logs of jumper deploy
   excite    plan safe, informative motions and record them on a simulated robot
 

@@ -240,7 +240,7 @@ def test_another_object_in_place_of_an_environment_or_a_model_is_refused(make, n
         (lambda env, model: register_task("mine", 3), "register_task needs names"),
         (lambda env, model: register_task("a/b", make_task), "register_task needs names"),
         (lambda env, model: register_task("mine", make_task, replace="no"), "replace must be True or False"),
-        (lambda env, model: load_motions(["/"]), "no npz, csv or parquet file"),
+        (lambda env, model: load_motions(["/"]), "no npz or csv file"),
         (lambda env, model: (env.reset(), env.use_reset_mask()), "before the first reset"),
         (lambda env, model: Env(HOLD, True), "num_envs must be a whole number"),
         (lambda env, model: Env(HOLD, 2, randomize=0), "randomize must be True or False, got 0"),
