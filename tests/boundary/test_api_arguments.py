@@ -23,7 +23,7 @@ from jumper_warp.envs.sb3 import Sb3VecEnv
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.identification.motions import RecordedMotion, load_motions
 from jumper_warp.policies.catalog import ONNX, add_files, read_files, summarise
-from jumper_warp.policies.policy import blend, save_policy
+from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import register_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.robot.description import DEFAULT_DESCRIPTION, load_description
@@ -195,8 +195,6 @@ def test_another_object_in_place_of_an_environment_or_a_model_is_refused(make, n
         (lambda env, model: write_film(recorded(model).recording(), "x.gif", field_of_view=-5.0), "field_of_view"),
         (lambda env, model: check_film("x.gif", (64, 64, 64), 10.0, 1.0), "size"),
         (lambda env, model: export_robot("xml", Path("none")), "kind must be mjcf or urdf or usd"),
-        (lambda env, model: blend("vertical_jump", load_policy("vertical_jump"), 0.5), "policy must be"),
-        (lambda env, model: blend(load_policy("vertical_jump"), None, 0.5), "other must be"),
         (lambda env, model: LimitsCfg(False, 90.0), "angle lower"),
         (lambda env, model: LimitsCfg("0", 90.0), "angle lower"),
         (lambda env, model: dataclasses.replace(vertical_jump_filter(), sum=(0.0, 90.0)), "filter sum"),
