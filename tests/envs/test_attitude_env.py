@@ -19,7 +19,7 @@ from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.metrics import measure
 from momentum_oracle import momentum, rotational_inertia
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 N = 64
 DEG = np.pi / 180.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from experiments.dynamics_agreement import differences, jumper_quantities, pinocchio_quantities, random_states
+from dynamics_oracle import differences, jumper_quantities, pinocchio_quantities, random_states
 from jumper_warp.kernels.kinematics.inverse import LegLimits
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.export import export_robot

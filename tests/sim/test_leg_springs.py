@@ -7,8 +7,8 @@ import pytest
 from jumper_warp.robot.model import load_description
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.sim.simulation import Simulation, motor_values
+from pinocchio_model import build_pinocchio
 from solver_helpers import Flight, Reference, bare_model, random_states
-from support.pinocchio_model import build_pinocchio
 
 STIFFNESS, LENGTH = 1000.0, 0.17  # [N/m], [m]
 KNEES = [[f"{leg}_{bar}_knee" for bar in ("outer", "inner")] for leg in ("FL", "FR", "BL", "BR")]

@@ -18,7 +18,7 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
 from leg_kernels import make_inverse_kernel, make_leg_kernel
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 LATERAL = (-50.0, 110.0)
 TRANSVERSAL = (-30.0, 140.0)
