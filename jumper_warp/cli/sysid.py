@@ -72,7 +72,6 @@ class ExciteCfg:
     num_candidates: int = 4  # Number of random motions of each kind, of which the most informative one is taken
     seconds: float = 1.25  # [s] Length of each motion
     num_sets: int = 1  # Number of sets to plan, each of two hung chirps, a standing chirp and a small jump
-    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics solver of the robot that is recorded
     robot: Path | None = None  # Folder, name or overlay of the robot that is recorded (default: the Jumper)
     noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
     no_noise: tyro.conf.FlagCreatePairsOff[bool] = False  # Record without noise
@@ -206,14 +205,7 @@ def excite(cfg: ExciteCfg) -> None:
     rng = None if cfg.no_noise else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
     motions = record_motions(
-        chosen,
-        folder,
-        robots=robots,
-        noise=cfg.noise,
-        solver=cfg.solver,
-        rng=rng,
-        torque=cfg.record_torque,
-        description=robot,
+        chosen, folder, scorer.replay, robots=robots, noise=cfg.noise, rng=rng, torque=cfg.record_torque
     )
     mass = float(total_mass(robots, robot)[0])
     content = json_bytes({"mass_kg": mass} | chosen.to_json())
