@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 def train(
     recipe: Recipe, *, seeds: Sequence[int] | None = None, checkpoints: Sequence[Checkpoint] = (),
-    command: str | None = None, expected_rate: float = 0.0, observers: Sequence[runner.Observer] = (),
+    command: str | None = None, observers: Sequence[runner.Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy, or one of each seed, save checkpoints in a new run's folder, and return the result.
 
     seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
-    (default: those that `recipe.train.resume` selects). command, expected_rate, observers: as in
+    (default: those that `recipe.train.resume` selects). command, observers: as in
     `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, has no
     observation, or no mirror image although a symmetric policy is requested; PolicyError or CheckpointError:
     `init_policy` cannot be used.
@@ -46,4 +46,4 @@ def train(
     if cfg.seeds:
         return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
     checkpoint = checkpoints[0] if checkpoints else None
-    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoint, expected_rate, observers)
+    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoint, observers)

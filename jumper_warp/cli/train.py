@@ -265,18 +265,15 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     task = recipe.task
     preset = bool(values_of("--preset", args))
     is_rank_0 = os.environ.get("RANK", "0") == "0"
-    rate = 0.0
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
         presets = () if preset or checkpoints else find_task(task.name)[1].presets
         report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, preset, presets)
-        if preset and recipe.solver == "jumper":
-            rate = PRESET_STEPS_PER_SECOND
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     command = command_line(args, modules)
     observers = watches(args) if is_rank_0 else []
     try:
-        result = train(recipe, checkpoints=checkpoints, command=command, expected_rate=rate, observers=observers)
+        result = train(recipe, checkpoints=checkpoints, command=command, observers=observers)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
             worlds = f"num_envs {cfg.num_envs} does not fit"
