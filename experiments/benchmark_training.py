@@ -7,22 +7,20 @@ with standing robots. The environment, with randomisation and noise, is timed wi
 jumps; training has learned actions. rsl-rl-lib
 trains on the same environment through the package's adapter. Outcomes are checked before the timing.
 
-`--variants eager` also times PPO without the fused kernels, `--variants all` all variants of `support.variants`.
-`--only-ppo` times PPO and its variants only.
+`--eager` also times PPO without the fused kernels. `--only-ppo` times PPO only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import warp as wp
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.scripts import ThreadArgs, report, run_script
 from support.speed import time_parts, time_ppo, time_rsl_rl
-from support.variants import VARIANTS, variant
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,8 @@ class Args(ThreadArgs):
     iterations: int = 10  # Number of timed training iterations of each trainer
     rsl_rl: bool = True  # Train with rsl-rl-lib too
     num_steps: int = 32  # Policy steps of each environment in an iteration
-    variants: tuple[str, ...] = ()  # Names of further timed variants of PPO (`support.variants`), or all
-    only_ppo: bool = False  # Time PPO and its variants only
-
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the trainer's variants to time."""
-        return tuple(VARIANTS) if self.variants == ("all",) else self.variants
+    eager: bool = False  # Time PPO without the fused kernels too
+    only_ppo: bool = False  # Time PPO only
 
 
 def main(args: Args) -> dict:
@@ -58,10 +52,9 @@ def main(args: Args) -> dict:
         values |= time_parts(envs, train_envs, args.steps, args.repeats, args.device)
     cfg = PpoCfg(num_steps=args.num_steps)
     values |= time_ppo(train_envs, cfg, args.iterations, args.device)
-    for name in args.names():
-        metrics = time_ppo(train_envs, variant(cfg, name), args.iterations, args.device)
-        values |= {f"{metric}_{name}": value for metric, value in metrics.items()}
-        write_metrics(folder, values)
+    if args.eager:
+        metrics = time_ppo(train_envs, replace(cfg, fused=False), args.iterations, args.device)
+        values |= {f"{metric}_eager": value for metric, value in metrics.items()}
     if not args.only_ppo:
         values["collect_env_share"] = args.num_steps * 1.0e-6 * values["env_step_us"] / values["ppo_collect_s"]
     if args.rsl_rl and not args.only_ppo:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import open_loop_jump
+from jumper_warp.cli.robot import recorded_jump
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jump_metrics import LandingPlayFlags
 from jumper_warp.evaluation.jumps import JumpLog
@@ -19,6 +19,7 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.files import Json
 from jumper_warp.viz.film import write_film
 from support.scripts import DeviceArgs, announce, prepare, report, run_script
@@ -55,12 +56,11 @@ def film_jump(args: Args, folder: Path) -> JumpLog:
 def main(args: Args) -> Json:
     """Simulate open-loop jump, paper's tests and filmed jump, print one summary, and return the metrics."""
     folder = prepare("demo", args)
-    values = {}
+    values: Json = {}
     announce("open-loop jump; the first run compiles kernels for up to a minute")
     (folder / "open_loop").mkdir(exist_ok=True)
-    metrics, _ = open_loop_jump.measure(open_loop_jump.Args(device=args.device), folder / "open_loop")
-    values |= {f"open_loop_{key}": value for key, value in metrics.items()}
-    paper = {"open_loop_apex_height_m": open_loop_jump.HARDWARE_APEX}
+    values["open_loop_apex_height_m"] = recorded_jump(RobotOverlay({}), folder / "open_loop")
+    paper = {"open_loop_apex_height_m": 1.075}
     for name, suite in SUITES.items():
         announce(f"{args.num_jumps} {name} jumps")
         flags = {"num_jumps": args.num_jumps, "device": args.device, "out": folder / f"{name}_jump"}

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from gradient_check import PUSH, TICKS, schedule, start
 from jumper_warp.diff.rollout import Rollout, Trajectory, compact
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.model import PHYSICS_DT, build_model
@@ -24,7 +25,6 @@ from jumper_warp.sim.dynamics import TOLERANCE
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
-from support.gradients import PUSH, TICKS, schedule, start
 from support.scripts import DeviceArgs, report, run_script
 from support.timing import device_memory, wall_time
 

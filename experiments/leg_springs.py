@@ -1,9 +1,10 @@
-"""Measure how much higher springs between the knees let the robot jump, and write metrics, a plot and recordings.
+"""Measure how high robots jump in open loop, without and with springs between the knees, and write metrics and a plot.
 
     python experiments/leg_springs.py --out outputs/springs
     python experiments/leg_springs.py --gravity 3.71 --torque-limit 24.8 --kp 20 --rest-length 0.17
+    python experiments/leg_springs.py --stiffness 0 --squat-angles 135 --torque-limit 24.8 --kp 20
 
-Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension) with another stiffness and squat. The
+Every robot makes an open-loop jump (squat, hold, full extension) with another stiffness and squat. The
 highest jump of each stiffness counts. A stretched spring pulls the knees together. Up to 90 degrees this extends the
 leg, and the motors have to pull the robot into its squat. Beyond 90 degrees it folds the leg, and the motors have to
 push the robot up. If a spring is too stiff for the motors, the robot stays standing or in its squat. The authors'
@@ -14,23 +15,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.robot.overlay import RobotOverlay, with_springs
 from jumper_warp.robot.values import RobotValues
+from jumper_warp.sim.apex import EXTEND, HOLD, RAMP
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.files import Json
 from jumper_warp.viz.plots import figure
-from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
 from support.scripts import DeviceArgs, prepare, report, run_script
 
+STAND = 60  # Policy steps in the default pose before the jump
 FALLING = 60  # Number of policy steps after the extension in which a jump may still rise
 FILTERS = {"stock": vertical_jump_filter, "loose": loose_filter}  # Functions that return the command filter, by name
+
+
+def transversal_command(step: int, squat: float) -> float:
+    """Return the angle [rad] that the open-loop jump commands to the transversal motors at a policy step.
+
+    The default pose has 45 degrees; -45 degrees extend the legs.
+    squat [deg]: commanded angle of the squat.
+    """
+    if step >= STAND + RAMP + HOLD:
+        return float(np.radians(-45.0))
+    return float(np.radians(45.0 + (squat - 45.0) * np.clip((step - STAND) / RAMP, 0.0, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -43,18 +54,6 @@ class SpringJumps:
     length: float  # [m] Rest length of the springs
     device: str | None  # Warp device, None: the default
 
-    def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:
-        """Return a simulation of `count` robots; robot: their parameters; settings: more arguments of `Simulation`."""
-        return Simulation(
-            count,
-            motors=self.motors,
-            command_filter=FILTERS[self.filter](),
-            gravity=self.gravity,
-            robot=robot,
-            device=self.device,
-            **settings,
-        )
-
     def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
         """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).
 
@@ -65,23 +64,24 @@ class SpringJumps:
         robots = RobotValues.nominal(shape[0] * shape[1])
         robots.spring_stiffness[:, 0] = np.repeat(stiffness, shape[1])
         robots.spring_length[:, 0] = self.length
-        sim = self.simulation(shape[0] * shape[1], robots, visuals=False)
+        sim = Simulation(
+            shape[0] * shape[1],
+            motors=self.motors,
+            command_filter=FILTERS[self.filter](),
+            gravity=self.gravity,
+            robot=robots,
+            visuals=False,
+            device=self.device,
+        )
         apex = np.zeros(sim.num_worlds)
         extend_step = STAND + RAMP + HOLD
         for tick in range(extend_step + EXTEND + FALLING):
-            commands = [transversal_command(min(tick, extend_step + EXTEND - 1), squat) for squat in squats]
+            commands = [transversal_command(tick, squat) for squat in squats]
             sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
             sim.step()
             if tick >= extend_step:
                 apex = np.maximum(apex, sim.joint_q()[:, 2])
         return apex.reshape(shape)
-
-    def record(self, stiffness: float, squat: float, folder: Path) -> dict[str, float]:
-        """Simulate one jump, write its recording, return `trace_metrics`; stiffness [N/m], squat [deg]: command."""
-        sim = self.simulation(1, with_springs(stiffness, self.length))
-        trace, recorder = simulate_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
-        recorder.save_rrd(folder / f"jump_{self.filter}.rrd")
-        return trace_metrics(trace)
 
 
 SUMMARY = ("apex_without_springs_m", "highest_apex_height_m", "highest_stiffness_n_m")  # Ends of keys
@@ -121,14 +121,13 @@ def main(args: Args) -> dict:
             jumps = args.jumps(name)
             apexes = jumps.apexes(args.stiffness, args.squat_angles)
             best = apexes.max(axis=1)
-            top = int(apexes.max(axis=1).argmax())
+            top = int(best.argmax())
             squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
-                       f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip
+                       f"{name}_highest_stiffness_n_m": args.stiffness[top],
+                       f"{name}_highest_apex_height_m": float(best[top])}  # fmt: skip
             if 0.0 in args.stiffness:
                 values[f"{name}_apex_without_springs_m"] = float(best[args.stiffness.index(0.0)])
-            recorded = jumps.record(args.stiffness[top], squats[top], folder)
-            values |= {f"{name}_highest_{key}": value for key, value in recorded.items()}
             axis.plot(args.stiffness, best, marker="o", label=f"{name} filter")
         axis.set(xlabel="stiffness between the knees [N/m]", ylabel="highest base height [m]")
     return report(args, folder, values, title, [key for key in values if key.endswith(SUMMARY)])

@@ -114,7 +114,8 @@ class Args(ThreadArgs):
     out: Path = Path("outputs/policies")  # Folder of all rows
     policies: tuple[str, ...] = (*policy_tasks(), COMBINED)
     """Names of the policies; combined: the three policies that walk and jump in turns."""
-    conditions: tuple[str, ...] = (*CONDITIONS, *TESTS)  # Names of the conditions and further tests
+    conditions: tuple[str, ...] = (*CONDITIONS, *(name for name, test in TESTS.items() if "command" in test))
+    """Names of the conditions and further tests."""
     seeds: tuple[int, ...] = (0, 1)  # Seeds of sampled commands, robots and noise
     trials: int = 4096  # Least number of trials in a row
     save_to_policies: tyro.conf.FlagCreatePairsOff[bool] = False

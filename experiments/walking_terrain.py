@@ -1,11 +1,13 @@
-"""Measure how far a policy walks on slopes, stairs and uneven ground, and write metrics, a plot and recordings.
+"""Measure how far a policy walks on slopes, stairs, uneven ground and under kicks, and write metrics and recordings.
 
     python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
+    python experiments/walking_terrain.py --policy walking_flat --terrains flat --kick 0.5 --randomize
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
 They do not observe the terrain. The metric of a terrain is the mean fraction of the commanded distance that they walk
-before they fall. Slopes and stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation,
-noise and latency of the training. `--solver mujoco` evaluates on physics that the policy was not trained on.
+before they fall. Slopes and stairs descend from the start, bowls and pits ascend. `--kick` changes the velocity of each
+base in a random direction every 3 s. `--randomize` adds the randomisation, noise and latency of the training.
+`--solver mujoco` evaluates on physics that the policy was not trained on.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog, check_velocity_settings
@@ -21,10 +24,33 @@ from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.tasks.velocity.cfg import VelocityEvaluation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean, rate
-from jumper_warp.viz.plots import figure
 from support.scripts import run_script
 
 SECONDS = 10.0  # [s] Time of each walk
+KICK_INTERVAL = 3.0  # [s] Time from one kick to the next
+
+
+@dataclass
+class KickedWalks(VelocityLog):
+    """Log of walks whose bases are kicked every KICK_INTERVAL: their velocities change abruptly by `kick`."""
+
+    kick: float = 0.0  # [m/s] Size of the change, in a random horizontal direction
+    seed: int = 0  # Seed of the directions
+
+    def begin(self, env: Env) -> None:
+        """Reset every robot, as `VelocityLog.begin`."""
+        self.rng = np.random.default_rng(self.seed)
+        super().begin(env)
+
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
+        """Return the arrays of `VelocityLog.read_env`, and add due kicks to the bases' velocities."""
+        arrays = super().read_env(env)
+        if self.kick and (len(self.velocity) + 1) % round(KICK_INTERVAL / env.step_dt) == 0:
+            angle = self.rng.uniform(0.0, 2.0 * np.pi, env.num_envs)
+            rates = env.sim.joint_qd().copy()
+            rates[:, :2] += self.kick * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            env.sim.state.joint_qd.assign(rates.ravel())
+        return arrays
 
 
 @dataclass(frozen=True)
@@ -38,6 +64,7 @@ class Args(EvaluationArgs):
     uneven: float = 0.05  # [m] Largest height or depth of random ground
     slope: float = 10.0  # [deg] Inclination of slopes
     step_height: float = 0.06  # [m] Height of steps
+    kick: float = 0.0  # [m/s] Change of the base's velocity every 3 s
     num_recorded: int = 1  # Number of robots to record on each terrain for the Rerun viewer; 0: none
 
     def __post_init__(self) -> None:
@@ -58,26 +85,21 @@ def walked_fraction(walks: VelocityLog) -> np.ndarray:
 
 
 def main(args: Args) -> dict:
-    """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
+    """Run the walks on every terrain and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, VelocityEvaluation)
     commands = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1))
     metrics = {}
-    fractions = {}
     steps = (args.step_height, args.step_height)
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=steps, seed=args.stream_seed)
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.num_robots, ground=ground)
-        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.stream_seed))
+        headings = random_headings(args.num_robots, args.stream_seed)
+        log = KickedWalks(commands, env.task, SECONDS, headings=headings, kick=args.kick, seed=args.stream_seed)
         walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
-        fractions[kind] = walked_fraction(walks)
-        metrics[f"{kind}_walked_fraction_mean"] = mean(fractions[kind], f"robots on {kind}")
+        metrics[f"{kind}_walked_fraction_mean"] = mean(walked_fraction(walks), f"robots on {kind}")
         metrics[f"{kind}_fall_rate"] = rate(walks.fallen, f"robots on {kind}")
-    settings = {"title": f"Walks at {args.speed:g} m/s", "conditions": f"{run.title}, {args.num_robots} robots each"}
-    with figure(run.folder / "terrain.png", figsize=(7, 4), **settings) as axis:
-        axis.boxplot([fractions[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
-        axis.set(ylabel="share of the way [1]", ylim=(0.0, 1.05))
-    run.settings["speed_m_s"] = args.speed
+    run.settings |= {"speed_m_s": args.speed} | ({"kick_m_s": args.kick} if args.kick else {})
     return run.report(metrics, {}, [*metrics])
 
 

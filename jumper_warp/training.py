@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 def train(
     recipe: Recipe, *, seeds: Sequence[int] | None = None, checkpoints: Sequence[Checkpoint] = (),
-    command: str | None = None, expected_rate: float = 0.0, observers: Sequence[runner.Observer] = (),
+    command: str | None = None, observers: Sequence[runner.Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy, or one of each seed, save checkpoints in a new run's folder, and return the result.
 
     seeds: several trainings side by side (default: recipe.train.seeds). checkpoints: to continue from, one of each seed
-    (default: those that `recipe.train.resume` selects). command, expected_rate, observers: as in
+    (default: those that `recipe.train.resume` selects). command, observers: as in
     `jumper_warp.rl.runner.train`, which lists the errors. Also raises InputError: the task cannot be saved, has no
     observation, or no mirror image although a symmetric policy is requested; PolicyError or CheckpointError:
     `init_policy` cannot be used.
@@ -40,14 +40,10 @@ def train(
         cfg = dataclasses.replace(cfg, seeds=tuple(seeds))
     if cfg.ppo.symmetry != "off":
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
-    actor_init = as_rsl_rl = None
+    actor_init = None
     if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
-    if cfg.trainer == "rsl-rl":
-        from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     if cfg.seeds:
         return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
     checkpoint = checkpoints[0] if checkpoints else None
-    return runner.train(
-        cfg, recipe.make_env, command, as_rsl_rl, actor_init, checkpoint, expected_rate, observers
-    )  # fmt: skip
+    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoint, observers)

@@ -48,7 +48,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
     )),
     "identification": ("Identification", (
         "identification.identify", "identification.parameters", "identification.recording",
-        "identification.motions", "identification.excitation", "identification.actuators",
+        "identification.motions", "identification.excitation",
         "identification.residuals", "identification.least_squares", "identification.initial_states",
         "identification.uncertainty", "identification.results", "identification.report", "identification.replay",
     )),

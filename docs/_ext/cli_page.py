@@ -25,7 +25,7 @@ from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
 from jumper_warp.cli.rescore import RescoreCfg
 from jumper_warp.cli.robot import CheckCfg, NewCfg, ShowCfg
 from jumper_warp.cli.sweep import SweepCfg
-from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
+from jumper_warp.cli.sysid import ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP, TrainArgs
 from jumper_warp.cli.try_task import TryCfg
@@ -82,7 +82,6 @@ def cli_page() -> str:
           for name, kind in (("new FOLDER", NewCfg), ("check ROBOT", CheckCfg), ("show ROBOT", ShowCfg))),
         section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
         section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
-        section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
         section("list", COMMANDS["list"], list_flags(ListCfg)),
         section("list runs", doc(RunsCfg), list_flags(RunsCfg)),
         section("info NAME", COMMANDS["info"], list_flags(InfoCfg)),

@@ -263,12 +263,15 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
 
 def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:
     """Time training with rsl-rl-lib on the same environment and settings, and return the metrics."""
+    from rsl_rl.runners import OnPolicyRunner
+
     from jumper_warp.envs.rsl_rl import RslRlVecEnv
-    from jumper_warp.rl.rsl_rl import train_rsl_rl
+    from jumper_warp.rl.rsl_rl import rsl_rl_config
 
     env, _ = stepping_env(envs, device)
     with contextlib.redirect_stdout(io.StringIO()):
-        cfg = PpoCfg(num_steps=num_steps)
-        runner = train_rsl_rl(RslRlVecEnv(env, num_steps), cfg, iterations=2, save_interval=10**6, seed=1)
+        config = rsl_rl_config(PpoCfg(num_steps=num_steps), save_interval=10**6, seed=1)
+        runner = OnPolicyRunner(RslRlVecEnv(env, num_steps), config, log_dir=None, device=str(env.device))
+        runner.learn(2)
         wall = wall_time(lambda: runner.learn(iterations), device) / iterations
     return {"rsl_rl_steps_per_s": num_steps * envs / wall, "rsl_rl_iteration_s": wall}

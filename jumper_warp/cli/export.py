@@ -33,8 +33,6 @@ class ExportCfg:
     """Folder of a static web page on which a visitor drives the robot, with these policies and the project's others."""
     bundle: bool = False
     """Write a folder for the robot: policies with their conformance vectors, deploy.yaml and the runtime deploy.pyz."""
-    blend: tuple[str, float] | None = None
-    """Second policy, and its weight, 0 to 1, in the weighted mean of both networks."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -54,15 +52,15 @@ def export(cfg: ExportCfg) -> Path:
     """Write a policy as a folder or an ONNX file, print its path and return it.
 
     For a training run, also prints on standard error which checkpoint is exported. Raises PolicyError: the source
-    cannot be used, two policies cannot be blended, the folder has a file's suffix, or exists without `overwrite`.
+    cannot be used, the folder has a file's suffix, or exists without `overwrite`.
     CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.catalog import is_run, newest_run, run_folder
-    from jumper_warp.policies.policy import Policy, blend, checked_folder, export_onnx, learning_curve, save_policy
+    from jumper_warp.policies.policy import Policy, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
-    if (cfg.page is not None) + cfg.bundle + (cfg.blend is not None) > 1 or None not in (cfg.page, cfg.out):
-        raise InputError("--page, --bundle and --blend exclude each other, and so do --page and --out")
+    if cfg.page is not None and (cfg.bundle or cfg.out is not None):
+        raise InputError("--page excludes --bundle and --out")
     if cfg.page is not None:
         return export_page(cfg, cfg.page)
     if cfg.bundle and cfg.sources:
@@ -77,8 +75,6 @@ def export(cfg: ExportCfg) -> Path:
     if trained:
         chosen = ("newest " if cfg.newest else "best ") if (source / CHECKPOINTS).is_dir() else ""
         print(f"{run_folder(source)}: {chosen}checkpoint, iteration {policy.config['iteration']}", file=sys.stderr)
-    if cfg.blend is not None:
-        policy = blend(policy, Policy.load(cfg.blend[0]), cfg.blend[1])
     out = cfg.out
     if out is None:
         out = run_folder(source) / "policy" if trained else Path(f"{policy.interface.task}.onnx")

@@ -13,6 +13,7 @@ from jumper_warp.cli.main import UsageError, parse
 
 if TYPE_CHECKING:
     from jumper_warp.robot.overlay import RobotOverlay
+    from jumper_warp.sim.simulation import SolverName
 
 USAGE = """\
 usage: jumper robot new FOLDER [--from SOURCE]
@@ -96,23 +97,32 @@ def check(cfg: CheckCfg) -> Path:
     """Print a robot's measures and what is implausible, write picture and recording, and return the recording."""
     from jumper_warp.robot.plausible import facts, implausible
     from jumper_warp.robot.values import described
-    from jumper_warp.sim.apex import OpenLoopJump
     from jumper_warp.utils.output import output_dir
-    from jumper_warp.viz.recorder import Recorder
 
     robot = robot_at(cfg.robot)
     description = described(robot.robots(), robot.description)
     folder = output_dir("robot", cfg.out)
-    jump = OpenLoopJump(robot, cfg.solver, visuals=True)
-    recorder = Recorder(jump.sim.model, notes={"robot": description.name})
-    apex = jump.run(lambda: recorder.record(recorder.frames / 60.0, jump.sim.links()[0][0]))
+    apex = recorded_jump(robot, folder, cfg.solver)
     for name, value in facts(description).items():
         print(f"{name:<22}{value}")
     print(f"{'open-loop apex':<22}{apex:.3f} m (SolverJumper)" if cfg.solver == "jumper" else f"apex {apex:.3f} m")
     for line in implausible(description, apex):
         print(f"implausible: {line}")
-    print(recorder.save_picture(folder / "robot.png"))
-    return recorder.save_rrd(folder / "jump.rrd")
+    print(folder / "robot.png")
+    return folder / "jump.rrd"
+
+
+def recorded_jump(robot: RobotOverlay, folder: Path, solver: SolverName = "jumper") -> float:
+    """Write recording `jump.rrd` and picture `robot.png` of an open-loop jump to a folder; return its apex [m]."""
+    from jumper_warp.sim.apex import OpenLoopJump
+    from jumper_warp.viz.recorder import Recorder
+
+    jump = OpenLoopJump(robot, solver, visuals=True)
+    recorder = Recorder(jump.sim.model, notes={"robot": robot.description.name})
+    apex = jump.run(lambda: recorder.record(recorder.frames / 60.0, jump.sim.links()[0][0]))
+    recorder.save_rrd(folder / "jump.rrd")
+    recorder.save_picture(folder / "robot.png")
+    return apex
 
 
 def show(cfg: ShowCfg) -> None:

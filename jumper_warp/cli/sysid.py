@@ -24,17 +24,15 @@ if TYPE_CHECKING:
 HELP = f"""\
 usage: jumper sysid [fit] DATA ... [flags]
        jumper sysid excite [flags]
-       jumper sysid actuator BENCH [flags]
 
-  DATA      recorded motions: npz, csv or parquet files, folders of them, or
+  DATA      recorded motions: npz or csv files, folders of them, or
             logs of jumper deploy
   excite    plan safe, informative motions and record them on a simulated robot
-  actuator  limits, friction and latency of one motor from a test bench
 
 The result identified.json is for --robot of jumper train, evaluate and play.
 If the fit is not consistent with the data, it is inconsistent.json, and the exit
 code is 3.
-jumper sysid fit --help, excite --help and actuator --help list the flags.
+jumper sysid fit --help and excite --help list the flags.
 
 {TASK_MODULE_HELP}"""
 
@@ -74,7 +72,6 @@ class ExciteCfg:
     num_candidates: int = 4  # Number of random motions of each kind, of which the most informative one is taken
     seconds: float = 1.25  # [s] Length of each motion
     num_sets: int = 1  # Number of sets to plan, each of two hung chirps, a standing chirp and a small jump
-    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics solver of the robot that is recorded
     robot: Path | None = None  # Folder, name or overlay of the robot that is recorded (default: the Jumper)
     noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
     no_noise: tyro.conf.FlagCreatePairsOff[bool] = False  # Record without noise
@@ -91,21 +88,8 @@ class ExciteCfg:
             raise InputError(f"num_candidates must be in 1 to 1000 and num_sets in 1 to 100, got {given}")
 
 
-@dataclass(frozen=True)
-class ActuatorCfg:
-    """Fit limits, friction and latency of one motor to data of a test bench: writes actuator.json."""
-
-    bench: Annotated[Path, tyro.conf.Positional]
-    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see
-    docs/tutorials/identification.md."""
-    motor: Literal["lateral", "transversal"] = "transversal"  # Kind of motor; its described constants are the prior
-    torque_noise: float = 0.1  # [N m] Noise of the bench's torque sensor, standard deviation
-    out: Path | None = None  # Folder for the results (default: outputs/actuator/<time>)
-    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print actuator.json in place of a table
-
-
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper sysid` with the given arguments: identify the robot, plan motions, or identify one motor.
+    """Run `jumper sysid` with the given arguments: identify the robot, or plan motions.
 
     modules: unused, as all commands take it. Raises InputError or OSError: data or a flag is invalid.
     """
@@ -116,8 +100,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         raise SystemExit(0)
     if args[0] == "excite":
         excite(parse(ExciteCfg, "sysid excite", args[1:]))
-    elif args[0] == "actuator":
-        characterise(parse(ActuatorCfg, "sysid actuator", args[1:]))
     else:
         sysid(parse(SysidCfg, "sysid fit", args[1:] if args[0] == "fit" else args))
 
@@ -223,14 +205,7 @@ def excite(cfg: ExciteCfg) -> None:
     rng = None if cfg.no_noise else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
     motions = record_motions(
-        chosen,
-        folder,
-        robots=robots,
-        noise=cfg.noise,
-        solver=cfg.solver,
-        rng=rng,
-        torque=cfg.record_torque,
-        description=robot,
+        chosen, folder, scorer.replay, robots=robots, noise=cfg.noise, rng=rng, torque=cfg.record_torque
     )
     mass = float(total_mass(robots, robot)[0])
     content = json_bytes({"mass_kg": mass} | chosen.to_json())
@@ -243,29 +218,3 @@ def excite(cfg: ExciteCfg) -> None:
     num_identified = int((chosen.std < 0.5).sum())
     print(f"{num_identified} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid fit {folder} --mass {mass:.3f}")
-
-
-def characterise(cfg: ActuatorCfg) -> None:
-    """Fit one motor's constants to test-bench data, print them with 95 % intervals, write actuator.json.
-
-    Exits with code 3 if the fit is not consistent with the data and a motor of this kind. Raises as `run`.
-    """
-    from jumper_warp.identification.actuators import characterise_motor, load_bench
-    from jumper_warp.utils.output import output_dir
-
-    result = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
-    folder = output_dir("actuator", cfg.out)
-    content = json_bytes(result.to_json())
-    write_atomically(folder / "actuator.json", content)
-    if cfg.json:
-        print(content.decode(), end="")
-    else:
-        for name, (value, low, high, unit) in result.rows().items():
-            note = ", not identified" if name in result.open else ""
-            print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}{note}")
-        print(f"χ² {result.chi2:.4g}")
-        print(folder / "actuator.json")
-    if result.inconsistency:
-        advice = "check sign, unit and noise of the torque"
-        print(f"jumper: not consistent: {result.inconsistency}; {advice}", file=sys.stderr)
-        raise SystemExit(INCONSISTENT)

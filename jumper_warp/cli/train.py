@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.flags import list_flags, option_of, switch_of, values_of, wants_help
+from jumper_warp.cli.flags import option_of, switch_of, values_of, wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
-from jumper_warp.rl.cfg import RSL_RL_UNUSED, TrainCfg
+from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
 from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.utils.threads import checked_threads
@@ -37,7 +37,7 @@ PRESET_STEPS_PER_SECOND = 20_000.0  # [1/s] Policy steps on two cores with a pre
 SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
 SHORT_HELP = (
     "preset", "num-envs", "max-iterations", "max-seconds", "seed", "randomize", "noise", "history", "solver", "robot",
-    "resume", "init-policy", "trainer", "ppo.hidden", "ppo.lr", "ppo.entropy-coef", "device", "threads", "log-root",
+    "resume", "init-policy", "ppo.hidden", "ppo.lr", "ppo.entropy-coef", "device", "threads", "log-root",
     "save-interval", "watch", "video-every", "task-module",
 )  # fmt: skip
 """Flags on the page of `jumper train --help`."""
@@ -73,8 +73,8 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     """Return the recipe that the arguments of `jumper train` make, and the checkpoints that are resumed.
 
     Exits with 0 after help. args: the task, then flags. With --resume the saved recipe of the run has the defaults.
-    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
-    a flag, or there is no such run.
+    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there
+    is no such run.
     """
     names = ", ".join(task_names())
     if wants_help(args[:1]):
@@ -93,8 +93,6 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     parsed, task = parse_settings(recipe, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
-    if unused := unused_flags(parsed.cfg.trainer, args):
-        raise UsageError(f"{', '.join(unused)}: not supported with trainer {parsed.cfg.trainer}")
     robot = overlay_in(args) or recipe.robot
     if robot is not None:
         task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
@@ -135,7 +133,7 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
     """Return and print the flags of the task's preset that --preset selects in unparsed arguments.
 
-    Flags that the arguments override, or that the --trainer does not use, are left out.
+    Flags that the arguments override are left out.
     Raises UsageError: the task has no such preset.
     """
     names = values_of("--preset", args)
@@ -149,24 +147,12 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
         raise UsageError(f"{task} has no preset {name!r:.60}; tasks with presets: {available}")
     flags = []
     option = ""
-    preset = shlex.split(entry.presets[name])
-    unused = unused_flags("".join(values_of("--trainer", args)[:1]), preset)
     given = {switch_of(option_of(arg)) for arg in args}
-    for word in preset:
+    for word in shlex.split(entry.presets[name]):
         option = option_of(word) or option
-        flags += [] if option in unused or switch_of(option) in given else [word]
+        flags += [] if switch_of(option) in given else [word]
     print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
     return flags
-
-
-def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
-    """Return the flags in unparsed arguments that a trainer does not use."""
-    if trainer != "rsl-rl":
-        return []
-    names = [name.replace("_", "-") for name in (*RSL_RL_UNUSED, "watch", "video-every")]
-    flags = list_flags(TrainArgs, described=False)
-    unused = {option for flag in flags if flag.name in names for option in flag.options}
-    return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
 
 
 def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
@@ -279,18 +265,15 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     task = recipe.task
     preset = bool(values_of("--preset", args))
     is_rank_0 = os.environ.get("RANK", "0") == "0"
-    rate = 0.0
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
         presets = () if preset or checkpoints else find_task(task.name)[1].presets
         report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, preset, presets)
-        if preset and recipe.solver == "jumper":
-            rate = PRESET_STEPS_PER_SECOND
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     command = command_line(args, modules)
     observers = watches(args) if is_rank_0 else []
     try:
-        result = train(recipe, checkpoints=checkpoints, command=command, expected_rate=rate, observers=observers)
+        result = train(recipe, checkpoints=checkpoints, command=command, observers=observers)
     except (MemoryError, RuntimeError) as error:
         if is_out_of_memory(error):
             worlds = f"num_envs {cfg.num_envs} does not fit"

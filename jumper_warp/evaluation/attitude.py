@@ -34,14 +34,6 @@ def axis_turns(count: int, angle: float) -> np.ndarray:
     return quats
 
 
-def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
-    """Return rotations by an angle [deg] about random body axes, as quaternions (count, 4), xyzw."""
-    axis = np.random.default_rng(seed).normal(size=(count, 3))
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    half = 0.5 * np.radians(angle)
-    return np.concatenate([np.sin(half) * axis, np.full((count, 1), np.cos(half))], axis=1)
-
-
 @dataclass
 class AttitudeLog(EvaluationLog):
     """Log of one commanded turn in free flight per world; properties: (num_envs,). A diverged world records NaN."""

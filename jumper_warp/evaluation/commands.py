@@ -192,7 +192,7 @@ def record(run: EvaluationRun, cfg: PlayCfg, live: Live | None = None) -> tuple[
     """
     from jumper_warp.evaluation.log import run_evaluation
     from jumper_warp.evaluation.recorder import EnvRecorder
-    from jumper_warp.evaluation.trained import warn_beyond_resets, warn_beyond_training
+    from jumper_warp.evaluation.trained import warn_beyond_training
 
     run.prepare("play", cfg.conditions, cfg.out)
     log = cfg.flags.log(run.evaluation.prepare_task(run.task))
@@ -210,9 +210,6 @@ def record(run: EvaluationRun, cfg: PlayCfg, live: Live | None = None) -> tuple[
         nominal = replace(cfg.conditions, randomize=False, noise=False, push_in_flight=False)
         act = PredictiveController(env, run.policy, run.env(log.count, conditions=nominal)).act
     run_evaluation(act, env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=stop)
-    columns = log.columns()
-    if any(key.startswith("command_") for key in columns):
-        warn_beyond_resets(env, {key: column for key, column in columns.items() if key.startswith("start_")})
     return log, recorder.recording()
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,11 +12,6 @@ from jumper_warp.evaluation.log import EvaluationLog, within
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.metrics import Metrics, rate
 
-if TYPE_CHECKING:
-    from jumper_warp.envs.env import Env
-
-RESETS = 100  # Number of resets that show the range of a user's command
-MARGIN = 0.1  # Distance from that range, relative to its width, that counts as within: samples rarely reach its ends
 TOLERANCE = 1.0e-6  # [m], [m/s], [rad/s] Distance from a range that counts as rounding
 
 
@@ -98,31 +92,3 @@ def trained_success(task: TaskCfg, log: EvaluationLog) -> Metrics:
         "within_training_success_rate": rate(success[inside], f"jumps with goals of trained {ranges} m"),
         "beyond_training_success_rate": rate(success[~inside], "jumps beyond training"),
     }
-
-
-def warn_beyond_resets(env: Env, start: Mapping[str, list[float]]) -> None:
-    """Print a warning on standard error if the robot starts in a state beyond those that training samples.
-
-    The world is put past the last curriculum level, where each reset samples one of all levels.
-    start: columns `start_<field>` of the first episode. Numbers that RESETS resets never vary are skipped.
-    """
-    drawn = []
-    for _ in range(RESETS):
-        env.episodes.level.fill_(len(env.task.levels))
-        env.reset()
-        drawn.append(env.task_arrays())
-    words = []
-    for key, (value, *_) in start.items():
-        name, _, index = key.removeprefix("start_").rpartition("_")
-        if name in drawn[0] and index.isdigit():
-            values = np.array([arrays[name][0, int(index)] for arrays in drawn])
-            label = f"{name}[{index}]"
-        else:
-            label = key.removeprefix("start_")
-            values = np.array([arrays[label][0] for arrays in drawn])
-        low = values.min()
-        high = values.max()
-        if max(low - value, value - high) > MARGIN * (high - low) > 0.0:
-            words.append(f"{label} {value:g} (resets sampled {low:.3g} to {high:.3g})")
-    if words:
-        print(f"jumper: beyond the training of {env.task.name}: {', '.join(words)}", file=sys.stderr)

@@ -13,13 +13,12 @@ import numpy as np
 
 from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
+from jumper_warp.robot.description import leg_dimensions, load_description
 from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 
@@ -158,25 +157,23 @@ def choose(
 def record_motions(
     chosen: Excitation,
     folder: Path,
+    replay: MotionReplay,
     *,
     robots: RobotValues,
     noise: NoiseLevels,
-    solver: SolverName = "jumper",
     rng: np.random.Generator | None = None,
     torque: bool = False,
-    description: RobotDescription | None = None,
 ) -> list[RecordedMotion]:
     """Record chosen motions on a simulated robot, and write each to `folder` as `<number>_<kind>.npz`. Returns them.
 
-    robots: values of the robot, N = 1; description: by default the Jumper's. solver: physics solver.
-    noise, rng, torque: see `measure`. Raises OSError.
+    replay: of the robot's description; robots: values of the robot, N = 1. noise, rng, torque: see `measure`.
+    Raises OSError.
     """
     motions = []
     with phase("recording motions", len(chosen.plans)) as advance:
         for i, plan in enumerate(chosen.plans):
             name = f"{i}_{plan.kind.replace(' ', '_')}"
-            record = simulate_plan(plan, solver=solver, robots=robots, description=description)
-            motions.append(measure(plan, name, record, robots, rng, noise, torque=torque))
+            motions.append(measure(plan, name, replay_plan(replay, plan, robots), robots, rng, noise, torque=torque))
             motions[-1].save(folder / f"{name}.npz")
             advance()
     return motions

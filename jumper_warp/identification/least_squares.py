@@ -32,7 +32,7 @@ LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviat
 FINAL_CHANGE = 0.03
 """Step of the final finite differences over other ones: jumps of the residuals on both sides of the minimum lie outside
 it. Steps 3 times longer or shorter change standard deviations by less than 0.5 % (robots 5 to 8 of the stream
-"development" of `experiments/identification_starts.py`)."""
+"development" of `experiments/identification_starts.py`, commit f0759887)."""
 FRICTION = "paw_friction"
 """Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. Costs are compared at
 its values `FRICTION_MOVES`, standard deviations of the prior from the minimum."""

@@ -1,4 +1,4 @@
-"""Recorded motions: motor targets, measurements and their noise, from npz, CSV or Parquet files."""
+"""Recorded motions: motor targets, measurements and their noise, from npz or CSV files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
 """Names of measured channels; each is a field of `RecordedMotion`."""
 PURPOSE = "recorded motions"
 MAX_CSV_BYTES = 64 * 2**20  # Size of the largest CSV file that is read
-MAX_ROWS, MAX_COLUMNS = 1_000_000, 200  # Largest table of a motion, more than an hour at 240 Hz
+MAX_ROWS = 1_000_000  # Largest table of a motion, more than an hour at 240 Hz
 DEGREES = math.pi / 180.0
 UNITS = {
     "time": {"s": 1.0, "ms": 1.0e-3, "us": 1.0e-6, "ns": 1.0e-9},
@@ -170,7 +170,7 @@ def _agree(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
-    """Read recorded motions from files; a folder stands for all its npz, CSV and Parquet files, sorted by name.
+    """Read recorded motions from files; a folder stands for all its npz and CSV files, sorted by name.
 
     settings: keyword arguments of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
     """
@@ -178,17 +178,17 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
     for path in map(Path, data):
         files += sorted(file for file in path.iterdir() if file.suffix in READERS) if path.is_dir() else [path]
     if not files:
-        raise InputError(f"no npz, csv or parquet file in {', '.join(map(str, data))}")
+        raise InputError(f"no npz or csv file in {', '.join(map(str, data))}")
     return [load_motion(file, **settings) for file in files]
 
 
 def load_motion(
     path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
 ) -> RecordedMotion:
-    """Read a recorded motion from an npz, CSV or Parquet file.
+    """Read a recorded motion from an npz or CSV file.
 
     base, gains and torque_limit [N m] override the file's settings unless "" or 0. npz: arrays named as the fields of
-    `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named `time`, `target/FL_lateral`,
+    `RecordedMotion`, settings as JSON in `settings`. CSV: columns named `time`, `target/FL_lateral`,
     `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the default: `angle/FL_outer
     [deg]`. Settings of a table are in a JSON file of the same name in its folder. torque_constant [N m/A]: torque at
     the joint per current, for tables with `current` instead of `torque`.
@@ -278,46 +278,6 @@ def cell_number(cell: str) -> float:
         raise ValueError(f"expected numbers, found {cell!r:.40}") from None
 
 
-def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read channels and settings of a recorded motion from a Parquet file.
-
-    Returns (arrays by channel in SI units, settings by name). Raises InputError: not a Parquet file, or pyarrow is not
-    installed; OSError.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InputError(
-            f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow"
-        ) from None
-    data = read_file(path, PURPOSE)
-    try:
-        file = pyarrow.parquet.ParquetFile(io.BytesIO(data))
-        if file.metadata.num_rows > MAX_ROWS or file.metadata.num_columns > MAX_COLUMNS:
-            raise InputError(f"{path}: expected at most {MAX_ROWS} rows and {MAX_COLUMNS} columns")
-        table = file.read()
-    except (pyarrow.ArrowException, OSError) as error:
-        raise InputError(f"{path}: not a Parquet file ({error!s:.200})") from None
-    try:
-        columns = [_column(name, table[name].to_numpy(zero_copy_only=False)) for name in table.column_names]
-    except (TypeError, ValueError, KeyError):
-        raise InputError(f"{path}: all columns must hold numbers, and have names of their own") from None
-    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), sidecar_settings(path)
-
-
-def _column(name: str, values: np.ndarray) -> np.ndarray:
-    """Return a column of a Parquet file as float64; points in time or durations in `time` as seconds since the first.
-
-    Raises TypeError: it has other values than numbers.
-    """
-    if values.dtype.kind in "mM" and name in ("time", "time [s]"):
-        return (values - values[:1]) / np.timedelta64(1, "s")
-    if values.dtype.kind not in "fiu" and any(value is not None for value in values):
-        raise TypeError(name)
-    return values.astype(np.float64)
-
-
 def sidecar_settings(path: Path) -> dict[str, Any]:
     """Return the settings of a motion in the JSON file next to its table, `walk.json` for `walk.csv`.
 
@@ -368,5 +328,5 @@ def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np
     return channels
 
 
-READERS = {".npz": read_motion, ".csv": read_csv, ".parquet": read_parquet}
+READERS = {".npz": read_motion, ".csv": read_csv}
 """Reader by suffix of the file: returns channels and settings of a path."""

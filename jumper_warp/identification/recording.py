@@ -7,16 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import warp as wp
 
 from jumper_warp.identification.initial_states import HANGING_HEIGHT, InitialStates, stance
 from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import channel_noise
-from jumper_warp.robot.description import RobotDescription, load_description
-from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
@@ -26,7 +22,6 @@ KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small 
 TICK = 1.0 / 60.0  # [s] between targets
 SAMPLES = 4  # rows of a motion per tick: 240 Hz
 REST = 0.75  # [s] in the first pose before a motion is recorded, in which the robot comes to rest
-HELD_MASS = 1.0e4  # [kg] mass of a held base in `simulate_plan`, which also resets its pose after each step
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +116,10 @@ def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Init
     return InitialStates(np.array([[0.0, 0.0, height]]), quaternion, zero, zero, angle, rest)
 
 
-def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
-    """Simulate one robot under planned motor targets from rest by `replay`, and return its motion at 240 Hz.
-
-    refine: physics steps per 1/480 s."""
+def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Record:
+    """Simulate one robot under planned motor targets from rest by `replay`, and return its motion at 240 Hz."""
     period = TICK / SAMPLES
-    stride = 2 * refine
+    stride = 2
     rest = round(REST / period)
     rows = plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
@@ -136,90 +129,6 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
     )  # fmt: skip
     rows = {name: values[rest:].copy() for name, values in vars(record).items() if name != "valid"}
     return Record(**rows, valid=record.valid)
-
-
-def simulate_plan(
-    plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0,
-    description: RobotDescription | None = None,
-) -> Record:  # fmt: skip
-    """Simulate one robot under planned motor targets from rest with any solver, and return its motion at 240 Hz.
-
-    robots: N = 1, by default as described; description: by default the Jumper's. dt [s]: physics step.
-    Raises InputError: dt does not divide 1/240 s.
-    """
-    period = TICK / SAMPLES
-    stride = round(period / dt)
-    if stride < 1 or abs(stride * dt - period) > 1.0e-6 * period:
-        raise InputError(f"dt must divide 1/240 s, got {dt}")
-    description = load_description() if description is None else description
-    robots = RobotValues.nominal(1, description) if robots is None else robots
-    held = plan.base == "fixed"
-    sim = _make_simulation(plan, solver, robots, dt, held, description)
-    rows = plan.rows
-    rest = round(REST / period)
-    target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
-    delay = float(robots.latency[0, 0]) / dt  # in physics steps
-    delayed_target = wp.zeros((12, 1), dtype=float, device=sim.device)
-    rows_read = []
-    held_pose = sim.joint_q()[0, :7].copy()
-    for row in range(len(target)):
-        q = sim.joint_q()[0].copy()
-        qd = sim.joint_qd()[0].copy()
-        for step in range(stride):
-            now = row * stride + step
-            whole = math.floor(delay)
-            newer, older = (target[max(now - whole - i, 0) // stride] for i in (0, 1))
-            blend = (1.0 - (delay - whole)) * newer + (delay - whole) * older
-            delayed_target.assign(blend[:, None].astype(np.float32))
-            sim.advance(1, delayed_target)
-            if step == 0 and row >= rest:  # the torques at the beginning of this step
-                torque = sim.torque.numpy()[:, 0]
-                rows_read.append(np.concatenate([motor_values(q[7:27]), motor_values(qd[6:26]), torque, q[:7]]))
-            if held:
-                _reset_base(sim, held_pose)
-    table = np.array(rows_read)[:, :, None]
-    valid = np.array([bool(np.isfinite(table).all()) and sim.dynamics.work.diverged.numpy()[0] == 0])
-    return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
-
-
-def _make_simulation(
-    plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool, description: RobotDescription
-) -> Simulation:
-    """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base.
-
-    So any solver can hold the base; a force cancels its weight.
-    """
-    values = RobotValues(**{name: value[:1].copy() for name, value in vars(robots).items()})
-    if held:
-        values.base_mass[:] = HELD_MASS
-        values.base_com[:] = 0.0
-    motors = MotorCfg.from_description(description, "jumping", plan.torque_limit, plan.torque_limit)
-    sim = Simulation(
-        1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, description=description, device="cpu",
-        threads=1,
-    )  # fmt: skip
-    angle = plan.target[0] - values.offset[0]
-    q = sim.joint_q()[0].copy()
-    q[7 + motor_values(np.arange(20))] = angle
-    height = stance(description, angle[None], np.zeros((1, 12))).height[0]
-    q[:3] = [0.0, 0.0, HANGING_HEIGHT if held else height + 1.0e-3]
-    sim.state.joint_q.assign(q.astype(np.float32))
-    sim.write_bodies()
-    if held:
-        weight = np.zeros((sim.model.body_count, 6), dtype=np.float32)
-        weight[0, :3] = -HELD_MASS * sim.model.gravity.numpy().reshape(-1, 3)[0]
-        sim.state.body_f.assign(weight)
-    return sim
-
-
-def _reset_base(sim: Simulation, pose: np.ndarray) -> None:
-    """Reset the base of world 0 to a pose (7,), position [m] and quaternion xyzw in the world frame, at rest."""
-    q = sim.state.joint_q.numpy()
-    qd = sim.state.joint_qd.numpy()
-    q[:7] = pose
-    qd[:6] = 0.0
-    sim.state.joint_q.assign(q)
-    sim.state.joint_qd.assign(qd)
 
 
 def measure(

@@ -1,4 +1,4 @@
-"""Trained policies: actor networks with their observation normalisers; loading, saving, blending and warm starts.
+"""Trained policies: actor networks with their observation normalisers; loading, saving and warm starts.
 
 `Policy.load` reads the project's policies, folders, checkpoints and runs; `save_policy` writes a folder.
 """
@@ -40,7 +40,7 @@ from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_on
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, checksum_entry, make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import checkpoint as checkpoints
-from jumper_warp.rl.actor_init import ActorInit, make_actor_init, rescale_inputs
+from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
 from jumper_warp.rl.metrics_file import METRICS_FILE
@@ -401,35 +401,6 @@ def export_onnx(policy: Policy, path: Path) -> Path:
 
 
 # ---------------------------------------------------------------------- further training
-
-
-def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
-    """Average the weights of two policies: (1 - fraction) * policy + fraction * other, with the normaliser of `policy`.
-
-    If one was fine-tuned from the other, or both from a third, the interpolated networks are usable policies too, which
-    trade off the strengths of both (Wortsman et al. 2022, Robust fine-tuning of zero-shot models). First the first
-    layer of `other` is rescaled to that normaliser. The configuration is a copy of `policy.config` with the entry
-    `blended`: the keys share (the fraction), and commit and iteration of `other`.
-    fraction: 0 gives `policy`; 1 acts like `other` wherever neither policy clips its normalised observation.
-    Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].
-    """
-    check_type("policy", policy, Policy)
-    check_type("other", other, Policy)
-    if not 0.0 <= fraction <= 1.0:
-        raise PolicyError(f"the fraction of a blend must be from 0 to 1, got {fraction}")
-    if policy.interface != other.interface:
-        raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
-    rescaled = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
-
-    def interpolate(tensor: torch.Tensor, other_tensor: torch.Tensor) -> torch.Tensor:
-        """Return the weighted mean of two tensors of one shape, float64."""
-        return (1.0 - fraction) * tensor.double() + fraction * other_tensor
-
-    pairs = zip(policy.layers, rescaled, strict=True)
-    layers = [(interpolate(w, other_w), interpolate(b, other_b)) for (w, b), (other_w, other_b) in pairs]
-    origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
-    config = policy.config | {"blended": {"share": fraction, **origin}}
-    return Policy(layers, policy.mean, policy.std, policy.interface, config)
 
 
 def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:

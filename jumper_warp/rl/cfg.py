@@ -167,8 +167,6 @@ class TrainCfg:
     """Policy, run or checkpoint to start from. It is a policy's name or folder, a run's folder (its best checkpoint) or
     a checkpoint. The training starts with its actor weights and observation statistics; critic, optimiser and noise
     are new."""
-    trainer: Literal["ppo", "rsl-rl"] = "ppo"
-    """Training algorithm: PPO, or rsl-rl-lib's PPO for comparison."""
     stop_on_nan: bool = False
     """Whether the training ends with exit status 1, after a checkpoint, when a term is not finite for the first time.
     Without it the value counts as 0, one line names it, and the state of its world is saved."""
@@ -177,7 +175,7 @@ class TrainCfg:
     wandb: str | None = None
     """Project of Weights & Biases to which metrics are uploaded (default: none); WANDB_MODE=offline keeps them here."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Hyperparameters of PPO; rsl-rl uses some of them."""
+    """Hyperparameters of PPO."""
 
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
@@ -199,32 +197,15 @@ class TrainCfg:
         for name in ("resume", "init_policy"):
             if getattr(self, name) == "":
                 raise InputError(f"{name} is empty: pass None to begin without it")
-            if self.trainer == "rsl-rl" and getattr(self, name):
-                raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
             raise InputError("pass resume, to continue a training, or init_policy, to begin one, not both")
-        if self.trainer == "rsl-rl" and self.seeds:
-            raise InputError("seeds are not supported with trainer rsl-rl; pass seed")
-        if self.trainer != "ppo" and self.ppo.symmetry != "off":
-            raise InputError(f"symmetry is not supported with trainer {self.trainer}")
 
     def check_processes(self, count: int) -> None:
-        """Raise InputError unless trainer, number of worlds and batch size are valid for a number of processes."""
-        if self.trainer != "ppo" and count > 1:
-            raise InputError(f"trainer {self.trainer} supports one process only")
+        """Raise InputError unless number of worlds and batch size are valid for a number of processes."""
         if self.seeds:
             if len(self.seeds) < count:
                 raise InputError(f"{count} processes need as many seeds, got {len(self.seeds)}")
             count = 1  # each process trains its seeds alone
         if self.num_envs % count:
             raise InputError(f"num_envs {self.num_envs} is not divisible by {count} processes")
-        if self.trainer == "ppo":
-            self.ppo.batch_size(self.num_envs // count)
-
-
-RSL_RL_UNUSED = (
-    "log_interval", "max_checkpoints", "best_metric", "seeds", "tensorboard", "wandb", "ppo.normalise_value",
-    "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
-    "ppo.graphs", "ppo.fused",
-)  # fmt: skip
-"""Dotted names of the settings in `TrainCfg` that trainer rsl-rl does not use and accepts with their defaults only."""
+        self.ppo.batch_size(self.num_envs // count)

@@ -45,10 +45,6 @@ class Stopwatch:
             mark.record()
         self._laps[-1].append(mark)
 
-    def lap_time(self) -> float:
-        """Return the time from the start of the current lap to its last mark [s] on a CPU, and 0 on a GPU."""
-        return 0.0 if self._cuda else self._laps[-1][-1] - self._laps[-1][0]
-
     def read(self) -> tuple[list[float], float]:
         """Return the mean time of each part [s] over the laps since the last call, and the host time per lap [s].
 
@@ -69,14 +65,10 @@ class TrainingConsole:
 
     brief = False  # Whether the end of a training is left out, since it is printed for all seeds together
 
-    def __init__(self, cfg: TrainCfg, iteration: int = 0, expected_rate: float = 0.0) -> None:
-        """Prepare the terminal; cfg: of the training. iteration: iterations so far.
-
-        expected_rate: as in `jumper_warp.rl.runner.train`.
-        """
+    def __init__(self, cfg: TrainCfg) -> None:
+        """Prepare the terminal; cfg: of the training."""
         self._console = _PipeSafeConsole(stderr=True)
         self._total, self._steps = cfg.max_iterations, cfg.ppo.num_steps * cfg.num_envs * max(1, len(cfg.seeds))
-        self._first, self._expected_rate = iteration + 1, expected_rate
         wrapped = TextColumn("{task.description}", table_column=Column(no_wrap=False))
         columns, hidden = (TimeElapsedColumn(), BarColumn(bar_width=12), wrapped), not self._console.is_terminal
         self._progress = Progress(*columns, console=self._console, disable=hidden)
@@ -106,30 +98,14 @@ class TrainingConsole:
         self._progress.update(self._task, completed=elapsed, total=elapsed + remaining, description=line)
         if not self._console.is_terminal:
             self.print_line(line)
-        if iteration > self._first:
-            self.check_rate(rate)
-
-    def print_speed(self, rate: float, remaining: float) -> None:
-        """Print the measured step rate [1/s] and the estimated time to the end [s]; warn if the rate is low."""
-        self.print_line(f"measured speed: {rate:,.0f} steps/s, about {format_duration(remaining)} left")
-        self.check_rate(rate)
-
-    def check_rate(self, rate: float) -> None:
-        """Print a warning, once, if the step rate [1/s] is less than half of the expected one."""
-        if 2.0 * rate < self._expected_rate:
-            usual = f"below {self._expected_rate / 2.0:,.0f} steps/s, {self._expected_rate:,.0f} are usual on two cores"
-            waiting = ", or restart with OMP_NUM_THREADS=1, since torch's threads wait for them"
-            advice = f"close other programs that use the cores{waiting if torch.get_num_threads() > 1 else ''}"
-            self.print_line(f"slow: {usual}; {advice}")
-            self._expected_rate = 0.0
 
 
 class SeedsConsole(TrainingConsole):
     """Terminal of several seeds: one line for all of them, with means and intervals over the seeds."""
 
-    def __init__(self, cfg: TrainCfg, iteration: int = 0, *, quiet: bool = False) -> None:
-        """Prepare the terminal; cfg, iteration: see `TrainingConsole`. quiet: print nothing."""
-        super().__init__(cfg, iteration)
+    def __init__(self, cfg: TrainCfg, *, quiet: bool = False) -> None:
+        """Prepare the terminal; cfg: of the training. quiet: print nothing."""
+        super().__init__(cfg)
         self._console.quiet = quiet
         self._logged: dict[int, dict[str, float]] = {}
         self._last = (0, 0.0)
@@ -175,12 +151,6 @@ class SeedConsole:
         """Keep the metrics until those of all seeds are shown."""
         self._console.add(self._seed, iteration, seeds[0], remaining)
 
-    def print_speed(self, rate: float, remaining: float) -> None:
-        """Print nothing: seeds share the device."""
-
-    def check_rate(self, rate: float) -> None:
-        """Print nothing: seeds share the device."""
-
 
 class TrainingLog:
     """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
@@ -195,7 +165,7 @@ class TrainingLog:
         logged of later iterations are removed. console: that shows progress (default: a new one).
         Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
-        self.console = TrainingConsole(cfg, iteration) if console is None else console
+        self.console = TrainingConsole(cfg) if console is None else console
         self._file = MetricsFile(folder / METRICS_FILE, iteration)
         self._events = EventsFile(folder, iteration, config) if cfg.tensorboard else None
         self._disk_full = False
@@ -234,19 +204,6 @@ class TrainingLog:
         if self._wandb:
             self._wandb.log(metrics, step=iteration)
         self.console.show(iteration, [metrics], remaining)
-
-    def print_speed(self, rate: float, remaining: float) -> None:
-        """Print the measured step rate [1/s] and the estimated time to the end [s]."""
-        self.console.print_speed(rate, remaining)
-
-    def check_rate(self, rate: float) -> None:
-        """Print a warning, once, if the step rate [1/s] is low."""
-        self.console.check_rate(rate)
-
-    def move(self, folder: Path) -> None:
-        """Continue the log in a new folder: copy the metrics file, even if deleted; end TensorBoard. Raises OSError."""
-        self._file = self._file.move(folder / METRICS_FILE)
-        self._events = None
 
     def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
         """Write an iteration's metrics as TensorBoard events; the first failure disables events."""
@@ -302,12 +259,6 @@ class NoLog:
 
     def print_line(self, line: str) -> None:
         """Discard the line."""
-
-    def print_speed(self, rate: float, remaining: float) -> None:
-        """Discard the speed."""
-
-    def check_rate(self, rate: float) -> None:
-        """Discard the step rate."""
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
         """Discard the metrics."""

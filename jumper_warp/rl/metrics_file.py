@@ -54,15 +54,6 @@ class MetricsFile:
             raise
         self._size, self._pending = self._size + written, b""
 
-    def move(self, path: Path) -> MetricsFile:
-        """Copy all lines, even of a deleted file, to `path`; close this file, return the new one. Raises OSError."""
-        self._file.seek(0)
-        write_atomically(path, self._file.read())
-        self.close()
-        moved = MetricsFile(path, math.inf)
-        moved._pending = self._pending
-        return moved
-
     def close(self) -> None:
         """Close the file."""
         self._file.close()

@@ -6,9 +6,9 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import TrainCfg
@@ -20,8 +20,6 @@ from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
-AsRslRl = Callable[[VecEnv, int], Any]
-"""Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 SOURCES = "sources"  # Folder in a run's folder that holds copies of the user's files
 
@@ -89,18 +87,3 @@ def report_non_finite(
         except OSError as error:
             print_line(f"{value}; {path}: {error.strerror}")
     return found
-
-
-def rescue_folder(folder: Path, config: Json, names: Iterable[str]) -> tuple[Path, str]:
-    """Return the folder in which a training run continues, a new one if any file of `names` was deleted, and a message.
-
-    If none was, return `folder` and an empty message.
-    The new folder is made beside the old one, with the configuration. Raises OSError: it cannot be written.
-    """
-    lost = [name for name in names if not (folder / name).is_file()]
-    if not lost:
-        return folder, ""
-    rescued = folder.with_name(f"{folder.name}_rescued")
-    rescued.mkdir(parents=True, exist_ok=True)
-    write_config(rescued, config)
-    return rescued, f"{folder}: {' and '.join(lost)} deleted during the training; continue with {rescued}"

@@ -14,7 +14,7 @@ from jumper_warp.rl.actor_init import ActorInit
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import Checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.run_folder import INTERRUPTED, AsRslRl, TrainResult
+from jumper_warp.rl.run_folder import INTERRUPTED, TrainResult
 from jumper_warp.rl.run_names import CHECKPOINTS
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.rl.training_run import TrainingRun
@@ -41,21 +41,18 @@ MakeEnv = Callable[[int, int, torch.device], VecEnv]
 
 
 def train(
-    cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
-    actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
-    observers: Sequence[Observer] = (),
+    cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, actor_init: ActorInit | None = None,
+    checkpoint: Checkpoint | None = None, observers: Sequence[Observer] = (),
 ) -> TrainResult:  # fmt: skip
     """Train a policy to the last iteration or the time limit, save a checkpoint, and return the result.
 
-    command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
-    by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
-    checkpoint of cfg.resume (default: loaded here). expected_rate: usual environment steps per second of all worlds on
-    two CPU cores; one line warns of less than half of it (0: no warning). observers: of the training, by trainer ppo.
+    command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). actor_init:
+    initialisation from cfg.init_policy, required with it. checkpoint: the loaded checkpoint of cfg.resume (default:
+    loaded here). observers: of the training.
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if a signal stopped the training (`StopRequest`),
-    with a message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted; without one
-    if weights are not finite.
+    with a message if a term was not finite and `stop_on_nan` is set; without one if weights are not finite.
     """
     with ExitStack() as cleanup:
         rank, checkpoints = prepare(cfg, actor_init, [checkpoint] if checkpoint else [], cleanup)
@@ -63,14 +60,8 @@ def train(
         if checkpoint is not None and rank.index == 0:
             lock(checkpoint, cleanup)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
-        if cfg.trainer == "rsl-rl":
-            if as_rsl_rl is None:
-                raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
-            from jumper_warp.rl.rsl_rl import run_rsl_rl
-
-            return run_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint, expected_rate)
+        run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))

@@ -52,7 +52,7 @@ def train(
         seeds = (list(resumed) or list(cfg.seeds))[rank.index :: rank.size]
         if not seeds:
             raise InputError(f"{rank.size} processes need as many seeds; the run has {len(resumed)} to continue")
-        console = SeedsConsole(cfg, 0 if first is None else first.state["iteration"], quiet=rank.index > 0)
+        console = SeedsConsole(cfg, quiet=rank.index > 0)
         cleanup.enter_context(console)
         console.print_line(f"run {folder}")
         device = Rank(0, 1, rank.device)

@@ -22,16 +22,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.logger import NoLog, Scores, SeedConsole, Stopwatch, TrainingConsole, TrainingLog
-from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.run_folder import (
-    CONFIG,
-    TrainResult,
-    full_config,
-    new_folder,
-    report_non_finite,
-    rescue_folder,
-    write_config,
-)
+from jumper_warp.rl.run_folder import CONFIG, TrainResult, full_config, new_folder, report_non_finite, write_config
 from jumper_warp.rl.run_names import CHECKPOINTS, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
@@ -40,7 +31,6 @@ PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/el
 """Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
 """Learning metrics in addition to the losses; those of Train/ exist only if an episode has ended."""
-WARM_UP = 5.0  # [s] A first iteration that takes longer measures the speed of a training on a CPU
 
 
 class TrainingRun:
@@ -48,12 +38,12 @@ class TrainingRun:
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None, expected_rate: float = 0.0, *, folder: Path | None = None,
+        checkpoint: Checkpoint | None = None, *, folder: Path | None = None,
         console: TrainingConsole | SeedConsole | None = None, stream: AbstractContextManager[None] | None = None,
     ) -> None:  # fmt: skip
         """Build the algorithm, and load the checkpoint, else apply `actor_init` if given.
 
-        command, actor_init, checkpoint, expected_rate: as in `train`. folder: of a new run (default: a new one, by
+        command, actor_init, checkpoint: as in `train`. folder: of a new run (default: a new one, by
         time). console: shows lines and progress (default: a new one). stream: context in which all work of the run is
         enqueued (default: the current stream). Raises InputError or CheckpointError as `train`.
         """
@@ -68,7 +58,6 @@ class TrainingRun:
         self.iteration = 0
         self.ended = False
         self.clock = TrainingClock(cfg)
-        self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
         self.metrics: dict[str, float] = {}
         self._scores = Scores(cfg.best_metric)
         self.notes: list[str] = []
@@ -89,7 +78,7 @@ class TrainingRun:
             self.folder = new_folder(cfg, rank)
         if console is None:
             self.notes.insert(0, f"run {self.folder}")
-            console = TrainingConsole(cfg, self.iteration, expected_rate)
+            console = TrainingConsole(cfg)
         self._console = console
         if rank.index == 0:
             write_config(self.folder, self.config)
@@ -152,12 +141,12 @@ class TrainingRun:
         self._watch.start()
         self.ppo.set_progress(self.clock.progress(self.iteration))
         self.ppo.collect()
-        self._mark()
+        self._watch.mark()
 
     def update(self) -> None:
         """Enqueue the update of an iteration on the device."""
         self.ppo.update()
-        self._mark()
+        self._watch.mark()
 
     def conclude(self, stop: StopRequest, ends: bool) -> None:
         """Count the iteration that was enqueued; log and save it where it is due. ends: whether it is the last one."""
@@ -172,12 +161,12 @@ class TrainingRun:
             self._check()
             is_last = is_last or bool(self.failure and self.rank.size == 1)
         if is_last or logs:
-            (times, seconds), self._is_timed = watch.read(), True
+            times, seconds = watch.read()
             self.metrics = self._read_metrics(times)
             self._scores.add(self.metrics)
             log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
-        elif self.iteration == self._first_iteration or not self._is_timed:
-            self._print_speed(self.iteration == self._first_iteration)
+        elif self.iteration == self._first_iteration:
+            watch.read()  # the rate in the log leaves the warm-up out
         if is_last and not self.failure and not self._console.brief:
             log.print_line(f"ended by {self.reason(stop)}")
         if (is_last or saves) and self._is_finite:
@@ -205,28 +194,9 @@ class TrainingRun:
         steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
         return f"{'an interruption' if stop.requested else self.clock.limit(self.iteration)}{steps}"
 
-    def _mark(self) -> None:
-        """Mark the end of a part of an iteration for timing; warn of a low step rate in a long first iteration."""
-        self._watch.mark()
-        if not self.clock.started and (seconds := self._watch.lap_time()) > WARM_UP:
-            self.log.check_rate(self._steps() / seconds)
-
-    def _print_speed(self, is_first: bool) -> None:
-        """Print a CPU's training speed; the first iteration counts only if it takes much longer than warm-up."""
-        times, seconds = self._watch.read()
-        if not self._is_timed and (seconds > WARM_UP or not is_first):
-            self.log.print_speed(self._steps() / sum(times), self.clock.remaining(self.iteration, seconds))
-            self._is_timed = True
-
     def _check(self) -> None:
-        """Report NaN and infinite terms; set `failure` if one, the weights or a deleted run folder end the training."""
-        folder, log, print_line = self.folder, self.log, partial(print, file=sys.stderr)
-        if isinstance(log, TrainingLog):
-            print_line = log.print_line
-            self.folder, failure = rescue_folder(folder, self.config, (CONFIG, METRICS_FILE))
-            self.failure = self.failure or failure
-            if self.folder != folder:
-                log.move(self.folder)
+        """Report NaN and infinite terms; set `failure` if one or the weights end the training."""
+        print_line = self.log.print_line if self.rank.index == 0 else partial(print, file=sys.stderr)
         self._is_finite = self.ppo.is_finite()
         if not self._is_finite:
             self.failure = self.failure or "the weights are not finite; the last checkpoint is the one before"
@@ -272,6 +242,9 @@ class TrainingRun:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
+            if not (self.folder / CONFIG).is_file():  # the run's folder was deleted
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_config(self.folder, self.config)
             path = save_checkpoint(folder, state, self._scores.mean(), self.cfg.max_checkpoints)
         except OSError as error:
             if is_last:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import functools
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,17 +91,18 @@ class RobotOverlay:
 
     def __post_init__(self) -> None:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
-        check_types("robot overlay", self)
         for name in ("values", "randomization"):  # arrays become tuples, which JSON can hold
+            check_type(f"robot overlay: {name}", getattr(self, name), Mapping)
             pairs = {key: tuple(np.asarray(row).tolist()) if np.ndim(row) == 1 else row
                      for key, row in getattr(self, name).items()}  # fmt: skip
             object.__setattr__(self, name, pairs)
+        check_types("robot overlay", self)
         check_names("quantity", self.values, (*RANGES, *LENGTHS))
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))
         for name in LENGTHS:
-            values = self.values.get(name, (0.1,))
-            if not len(values) <= 2 or not all(0.01 <= value <= 1.0 for value in values):
+            values = real_array(self.values.get(name, (0.1,)), f"robot overlay: {name}", float)
+            if values.shape not in ((1,), (2,)) or not ((values >= 0.01) & (values <= 1.0)).all():
                 raise InputError(f"robot overlay: {name} must be one or two lengths in 0.01 to 1 m, got {values}")
         for name, values in self.values.items():
             if name in LENGTHS:
@@ -172,13 +172,8 @@ class RobotOverlay:
         if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
             raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
         check_names("section", saved, SECTIONS)
-        sections = {}
-        for section in ("values", "randomization"):
-            table = saved.get(section, {})
-            if not isinstance(table, dict):
-                raise InputError(f"robot overlay: {section} must be an object")
-            sections[section] = {name: finite_tuple(f"{section} {name}", values) for name, values in table.items()}
-        return cls(**sections, source=str(saved.get("source", "")), robot=saved.get("robot"))
+        tables = {section: saved.get(section, {}) for section in ("values", "randomization")}
+        return cls(**tables, source=str(saved.get("source", "")), robot=saved.get("robot"))
 
     def save(self, path: Path) -> None:
         """Write the overlay as a JSON file. Raises OSError."""
@@ -200,23 +195,6 @@ def check_range(name: str, values: tuple[float, ...], allowed: Range) -> None:
         if not low <= value <= high:
             limits = f"{low:g} to {high:g}{unit and ' '}{unit}{hint}"
             raise InputError(f"robot overlay: {name} must be in {limits}, got {value:.6g}")
-
-
-def finite_tuple(name: str, values: Any) -> tuple[float, ...]:
-    """Convert a list of finite numbers to a tuple. Raises InputError for anything else; name: for the message."""
-    if not isinstance(values, list) or any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
-        raise InputError(f"robot overlay: {name!r:.60} must be a list of numbers")
-    if not all(math.isfinite(x) for x in values):
-        raise InputError(f"robot overlay: {name!r:.60} must be finite")
-    return tuple(float(x) for x in values)
-
-
-def with_springs(stiffness: float, length: float) -> RobotOverlay:
-    """Return an overlay with springs of a stiffness [N/m] and rest length [m] between the two knees of each leg.
-
-    Raises InputError: one of them is out of range.
-    """
-    return RobotOverlay({"spring_stiffness": (float(stiffness),), "spring_length": (float(length),)}, source="springs")
 
 
 def robots_of(robot: RobotOverlay | Sequence[RobotOverlay] | None) -> list[RobotOverlay]:

@@ -1,19 +1,15 @@
-"""Tasks of a robot with several skills (walking, jumping, turning in flight), and rules for switching between them.
+"""Tasks of a robot with several skills (walking, jumping), and rules for switching between them.
 
 A jump starts as in its training: at rest on four paws near the default pose, which walking reaches when it is commanded
 to stand. The jump command is set at the handover, since the walking policy stands with less motion than a waiting jump
 policy. Walking takes over once the robot has landed and rests, or after a failed landing. Each skill has its own
 observation, action scale, gains, torque limits and command filter.
-
-On request a jump hands over to turning in a long flight. Turning brings the base level, in the jump's heading, and
-hands back shortly before the landing.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp import terminations
 from jumper_warp.kernels.skills import handovers
@@ -24,28 +20,23 @@ from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.utils.errors import InputError
 
-FALLS, FALLS_FROM_FLIGHT = (
-    (
-        TerminationTerm(terminations.diverged),
-        TerminationTerm(terminations.collided),
-        TerminationTerm(tilt, angle=60.0 * DEG),
-        TerminationTerm(terminations.low_base, height=0.10),
-    )
-    for tilt in (terminations.tilted, terminations.fallen)
+FALLS = (
+    TerminationTerm(terminations.diverged),
+    TerminationTerm(terminations.collided),
+    TerminationTerm(terminations.tilted, angle=60.0 * DEG),
+    TerminationTerm(terminations.low_base, height=0.10),
 )
-"""Terminations of a robot that switches between skills; in the second tuple, a tilt in flight is no fall."""
+"""Terminations of a robot that switches between skills."""
 
 
-def for_switching(
-    task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
-) -> TaskCfg:
-    """Return a copy of a task for a robot that switches between skills, on level ground; only `falls` end its episodes.
+def for_switching(task: TaskCfg, randomization: RandomizationCfg) -> TaskCfg:
+    """Return a copy of a task for a robot that switches between skills, on level ground; only FALLS end its episodes.
 
     It has no rewards, critic, events and metrics. randomization: ranges for the robot, the same in all its skills.
     """
     task = replace(
         task,
-        terminations=falls,
+        terminations=FALLS,
         randomization=randomization,
         events=(),
         rewards=(),
@@ -53,30 +44,6 @@ def for_switching(
         metrics=(),
     )
     return task.on_level_ground()
-
-
-def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[Handover]]:
-    """Return the tasks [jump, turning] of a robot that turns in the flight of a jump, and handovers in both directions.
-
-    Both have the jump's gravity and randomisation, and keep momentum in free flight.
-    Raises InputError: `jump` is no jump task, or `turning` no attitude task.
-    """
-    for task, state in ((jump, JumpState), (turning, AttitudeState)):
-        if task.state is not state:
-            raise InputError(f"turning in flight needs a task with {state.key}, got {task.name}")
-    randomization = replace(jump.randomization, resample_at="reset")
-    jump, turning = (
-        for_switching(
-            replace(task, gravity=jump.gravity, eval_height_offset=jump.eval_height_offset, keep_momentum=True),
-            randomization,
-            FALLS_FROM_FLIGHT,
-        )
-        for task in (jump, turning)
-    )
-    return [jump, turning], [
-        Handover(jump, turning, handovers.jump_to_turn_due, handovers.begin_turn),
-        Handover(turning, jump, handovers.turn_to_jump_due, handovers.begin_landing),
-    ]
 
 
 def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[list[TaskCfg], list[Handover]]:

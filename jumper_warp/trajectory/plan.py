@@ -71,14 +71,14 @@ class PlanModel:
     """
 
     def __init__(
-        self, robots: Snapshot, goal: np.ndarray, *, tolerances: Tolerances | None = None, substeps: int = SUBSTEPS,
+        self, robots: Snapshot, goal: np.ndarray, *,
         double: bool = False, threads: int | None = None,
     ) -> None:  # fmt: skip
         """Copy the parameters of the robots of an environment of one task on level ground; others as in `Rollout`."""
         task = robots.tasks[0]
         self.rollout = Rollout(
             robots.model, task.motors, task.command_filter, double=double, threads=threads,
-            dt=robots.dt * robots.substeps / substeps, substeps=substeps,
+            dt=robots.dt * robots.substeps / SUBSTEPS, substeps=SUBSTEPS,
         )  # fmt: skip
         for name, tensor in robots.parameters.items():
             wp.to_torch(self.rollout.parameters[name]).copy_(tensor)
@@ -87,7 +87,7 @@ class PlanModel:
         self.default = robots.default_angle.cpu().numpy().astype(float)[:, None]
         self.pose = np.repeat(self.default, self.rollout.num_worlds, axis=1)
         self.goal = goal
-        self.tolerances = tolerances or Tolerances()
+        self.tolerances = Tolerances()
         self.terms = self.rollout.dynamics.modules.plan_cost
         self._kernel: Kernel = self.terms.plan_cost_kernel
 

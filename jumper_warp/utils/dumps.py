@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +13,6 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, parse_json
 
 FORMAT, VERSION = "jumper-warp dump", 1
-GROUPS = ("rewards", "observations")  # Arrays of the values of all terms, whose names are in the header
-LABEL = re.compile(r"[\w./ -]{1,250}")  # Names of tasks, terms and their components
 DUMPS = "non_finite"  # Folder in a run's folder that holds its dumps
 
 
@@ -58,17 +55,8 @@ def load_dump(path: Path) -> tuple[NonFiniteValue, Json]:
         header = parse_json(str(arrays.pop("header")), "header")
         if (header["format"], header["version"]) != (FORMAT, VERSION):
             raise InputError(f"expected a {FORMAT} of version {VERSION}")
-        names = header["names"]
-        shapes = {"joint_q": 43, "joint_qd": 38, "action": 12} | {group: len(names[group]) for group in GROUPS}
-        fits = all(arrays[name].shape == (size,) for name, size in shapes.items())
-        if not fits or any(values.dtype.kind not in "biuf" for values in arrays.values()):
-            raise InputError("an array has another shape or type")
-        labels = [header["task"], header["term"], *(name for group in GROUPS for name in names[group])]
-        counts = [header["world"], header["step"], header["iteration"], header["config"]["train"]["seed"]]
-        if not all(map(LABEL.fullmatch, labels)) or not all(type(count) is int for count in counts):
-            raise InputError("a name or count is malformed")
-        value = float(header["value"])
-        found = NonFiniteValue(header["term"], value, header["world"], header["step"], arrays, names)
+        numbers = float(header["value"]), header["world"], header["step"]
+        found = NonFiniteValue(header["term"], *numbers, arrays, header["names"])
     except (LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a dump ({type(error).__name__}: {error!s:.200})") from error
     return found, header

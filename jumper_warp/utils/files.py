@@ -1,12 +1,10 @@
 """Atomic file writes, and bounded reading of regular files and of JSON."""
 
 import errno
-import itertools
 import json
 import math
 import os
 import stat
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,8 +16,6 @@ Json = dict[str, Any]  # Object of JSON data, settings or values by name
 ErrorType = Callable[[str], InputError]
 MAX_BYTES = 256 * 2**20  # Size of the largest file that is read
 MAX_JSON_BYTES = 16 * 2**20  # Size of the largest JSON file that is read
-MAX_DEPTH = 50  # Levels of nested objects and lists in JSON
-MAX_DIGITS = 18  # Characters of an integer in JSON; all these are exact as int64
 
 
 @contextmanager
@@ -116,30 +112,17 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, fin
     """Parse JSON data (UTF-8) and return its content.
 
     where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
-    not JSON, nests deeper than MAX_DEPTH, repeats a key, cannot be encoded as UTF-8, or has such a number or an integer
-    of more than MAX_DIGITS characters.
+    not JSON, or has such a number.
     """
     hooks: Json = {"parse_constant": _number, "parse_float": _number} if finite else {}
     try:
         text = data.decode() if isinstance(data, bytes) else data
-        content = json.loads(text, object_pairs_hook=_unique, parse_int=_integer, **hooks)
-        _check_depth(content)
-        if "\\u" in text:  # an escape may be half of a surrogate pair
-            json.dumps(content, ensure_ascii=False).encode()
-        return content
+        return json.loads(text, **hooks)
     except json.JSONDecodeError as problem:
         reason = f"line {problem.lineno}: {problem.msg}"
     except (ValueError, RecursionError) as problem:
         reason = str(problem)
     raise error(f"{where}: not JSON ({reason:.200})")
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> Json:
-    """Convert the (key, value) pairs of a JSON object to a dict. Raises InputError: a key occurs twice."""
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        raise InputError(f"{Counter(key for key, _ in pairs).most_common(1)[0][0]!r:.60} occurs twice")
-    return table
 
 
 def _number(text: str) -> float:
@@ -148,20 +131,3 @@ def _number(text: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{text:.20} is not a finite number")
     return value
-
-
-def _integer(text: str) -> int:
-    """Convert the text of an integer in JSON to an int. Raises InputError: it is too long."""
-    if len(text) > MAX_DIGITS:
-        raise InputError(f"an integer of {len(text)} digits")
-    return int(text)
-
-
-def _check_depth(content: Any) -> None:
-    """Raise InputError if lists and objects of JSON data are nested deeper than MAX_DEPTH."""
-    level = [content]
-    for _ in range(MAX_DEPTH + 1):
-        parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
-        level = list(itertools.chain.from_iterable(parts))
-    if level:
-        raise InputError(f"more than {MAX_DEPTH} levels")

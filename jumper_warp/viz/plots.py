@@ -189,9 +189,9 @@ def plot_landings(
         axes[0, 0].set(ylabel="to the left [m]")
 
 
-def regular_polygons(centers: np.ndarray, radius: float, corners: int = 48) -> np.ndarray:
-    """Return the corners [m], (polygons, corners, 2), of regular polygons around centers [m], (polygons, 2)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+def regular_polygons(centers: np.ndarray, radius: float) -> np.ndarray:
+    """Return the corners [m], (polygons, 48, 2), of regular polygons around centers [m], (polygons, 2)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     return centers[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 

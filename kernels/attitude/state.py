@@ -24,10 +24,6 @@ class AttitudeState:
     old_error: float  # [rad] `error` of the previous policy step
     inside: int  # consecutive policy steps with `error` within tolerance, 0 outside
     collisions: int  # policy steps in which links touched each other or anything but a paw touched the ground
-    jump_start: wp.vec3  # [m] world, start of the jump that this flight is part of; 0 without a jump, as the next two
-    jump_goal: wp.vec3  # [m] world, goal of that jump: base x, y at landing and base height at the apex
-    goal_ground: float  # [m] height of the ground at `jump_goal`
-    max_height: float  # [m] highest base origin since takeoff, world z
     episodes: float  # number of episodes that lasted `episode_steps`
     sum_error: float  # [rad] sum of `error` at their ends
     settled: float  # number of them that ended within tolerance
@@ -74,7 +70,6 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
     t.old_error = state.error
     t.error = angle_between(robot.quat, state.goal)
     t.inside = wp.where(t.error <= tolerance, state.inside + 1, 0)
-    t.max_height = wp.max(state.max_height, robot.pos[2])
     if robot.collisions != 0:
         t.collisions = state.collisions + 1
     return t

@@ -17,7 +17,7 @@ import warp as wp
 from ..kinematics.five_bar import five_bar
 from ..kinematics.geometry import LegGeometry, leg_of
 from ..scalar import mat33, mat43, quat, real, vec3, vec4
-from ..terrain.ground import Ground, ground_distance, world_ground
+from ..terrain.ground import Ground, ground_distance
 from .distances import inflated_distance, segment_box_bound_sq, segment_box_sq, segment_segment_sq
 
 wp.set_module_options({"enable_backward": False})
@@ -291,38 +291,6 @@ def add_leg_distances(
 
 
 @wp.func
-def world_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, start: int,
-    margin: real,
-) -> Collisions:  # fmt: skip
-    """Return the forbidden contacts of one robot and the smallest distance [m] of all checked pairs, at most `margin`.
-
-    geometry: see `leg_of`. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
-    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are
-    clamped to it, which is fast; with 0 only the flags are meaningful. Flags of a non-finite state are undefined.
-    """
-    pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
-    rotation = wp.quat_to_matrix(
-        quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
-    )
-    collisions = Collisions()
-    collisions.clearance = margin
-    collisions = add_distance(
-        collisions,
-        body_ground_distance(ground, leg_of(geometry, world, 0).shell, pos, rotation),
-        real(0.0),
-        BODY_GROUND,
-    )
-    leg = load_leg(geometry, joint_q, world, start, 0)
-    count = wp.int32(4)
-    for order in range(count):
-        neighbour = load_leg(geometry, joint_q, world, start, next_leg(order + 1))
-        collisions = add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, real(0.0))
-        leg = neighbour
-    return collisions
-
-
-@wp.func
 def leg_collisions(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), world: int, start: int,
     order: int, min_distance: real,
@@ -330,7 +298,7 @@ def leg_collisions(
     """Return the flags of the forbidden contacts of one leg, at position `order` (0 to 3) around the body.
 
     For kernels with a thread per leg. Order 0 also checks the shell against the ground. The union over all four orders
-    equals the flags of `world_collisions` if min_distance is 0. min_distance [m]: links closer than this to another
+    has the flags of the robot. min_distance [m]: links closer than this to another
     link raise flags.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
@@ -348,26 +316,3 @@ def leg_collisions(
     leg = load_leg(geometry, joint_q, world, start, next_leg(order))
     neighbour = load_leg(geometry, joint_q, world, start, next_leg(order + 1))
     return add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, min_distance).flags
-
-
-@wp.kernel
-def collision_kernel(
-    # in
-    geometry: wp.array(dtype=LegGeometry),
-    ground: Ground,
-    joint_q: wp.array(dtype=wp.float32),
-    coords_per_world: int,
-    margin: real,
-    # out
-    flags: wp.array(dtype=wp.int32),
-    clearance: wp.array(dtype=wp.float32),
-):
-    """Write every robot's forbidden contacts and clearance [m] from `world_collisions`; one thread per world.
-
-    joint_q: Newton's, flat, `coords_per_world` per world.
-    """
-    world = wp.tid()
-    here = world_ground(ground, world)
-    collisions = world_collisions(geometry, here, joint_q, world, world * coords_per_world, margin)
-    flags[world] = collisions.flags
-    clearance[world] = wp.float32(collisions.clearance)

@@ -1,4 +1,4 @@
-"""Forward kinematics of one leg, its Jacobian and inverse velocity kinematics.
+"""Forward kinematics and inverse velocity kinematics of one leg.
 
 Motor angles and rates are ordered lateral, outer, inner. A leg's housing turns
 about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward; a positive outer or inner
@@ -8,7 +8,7 @@ front: +1 front leg, -1 back leg. The five-bar loop is planar: points (x, z) of 
 
 import warp as wp
 
-from ..scalar import mat33, real, vec2, vec3
+from ..scalar import real, vec2, vec3
 from .five_bar import FiveBar, five_bar
 from .geometry import LegGeometry
 
@@ -39,20 +39,6 @@ def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: 
 
 
 @wp.func
-def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
-    """Return the Jacobian of the paw's centre (body axes) w.r.t. lateral, outer, inner [m/rad], 3x3; angles [rad]."""
-    loop = five_bar(geo, outer, inner)
-    arm = rotate_lateral(geo, lateral, paw_in_housing(geo, loop))
-    by_outer = rotate_lateral(geo, lateral, vec3(loop.paw_do[0], real(0.0), loop.paw_do[1]))
-    by_inner = rotate_lateral(geo, lateral, vec3(loop.paw_di[0], real(0.0), loop.paw_di[1]))
-    return mat33(
-        real(0.0), by_outer[0], by_inner[0],
-        -geo.side * arm[2], by_outer[1], by_inner[1],
-        geo.side * arm[1], by_outer[2], by_inner[2],
-    )  # fmt: skip
-
-
-@wp.func
 def damped_ratio(speed: real, lever: real) -> real:
     """Return a thigh's rate [rad/s] for an ankle speed along the shank, damped where thigh and shank nearly align.
 
@@ -67,8 +53,8 @@ def damped_ratio(speed: real, lever: real) -> real:
 def leg_inverse_velocity(geo: LegGeometry, angles: vec3, paw_vel: vec3) -> vec3:
     """Return motor rates [rad/s] that move the paw at `paw_vel` [m/s] relative to the body, in the body frame.
 
-    The inverse of `leg_jacobian` at the motor angles [rad], exact within joint limits unless a thigh and its shank are
-    within 3.3 degrees of one line; there the rates are damped, to at most 100 rad/s per m/s along the shank.
+    Exact at motor angles [rad] within joint limits, unless a thigh and its shank are within 3.3 degrees of one line;
+    there the rates are damped, to at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
     vel = rotate_lateral(geo, -angles[0], paw_vel)

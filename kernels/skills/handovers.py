@@ -1,4 +1,4 @@
-"""Handovers between walking, jumping and turning in flight: conditions (`*_due`) and initial task states (`begin_*`).
+"""Handovers between walking and jumping: conditions (`*_due`) and initial task states (`begin_*`).
 
 Neither function changes the robot's state. requested: whether `Env.request` requested the target skill. A skill takes
 over in states like those from which its training starts, or where the other skill has failed. World z is up, policy
@@ -7,9 +7,7 @@ steps last 1/60 s.
 
 import warp as wp
 
-from ..attitude.state import AttitudeState, with_goal
-from ..jump.phase import time_to_height
-from ..jump.state import FLIGHT, LANDED, STANCE, JumpState
+from ..jump.state import LANDED, STANCE, JumpState
 from ..mdp.durations import NEVER
 from ..mdp.view import RobotView, tilt, yaw_of
 from ..velocity.state import VelocityState
@@ -25,9 +23,6 @@ LOST_TILT = wp.constant(0.35)  # [rad] tilt after touchdown beyond which walking
 LANDED_STEPS = wp.constant(18)  # policy steps after touchdown before which walking never takes over
 RECOVER_STEPS = wp.constant(60)  # policy steps after touchdown after which walking takes over in any state
 NO_JUMP_STEPS = wp.constant(150)  # policy steps in stance after which walking takes over without a jump
-FREE_STEPS = wp.constant(2)  # policy steps after a takeoff from which on turning takes over
-LANDING_TIME = wp.constant(0.35)  # [s] the jump takes over this long before the base falls below LANDING_HEIGHT
-LANDING_HEIGHT = wp.constant(0.45)  # [m] of the base above the ground
 
 
 @wp.func
@@ -88,53 +83,4 @@ def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
     new.goal_ground = robot.pos[2] - robot.height
     new.max_height = robot.pos[2]
     new.command_step = NEVER
-    return new
-
-
-@wp.func
-def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """Return whether turning takes over from a jump: on request, FREE_STEPS or more policy steps into the flight."""
-    return requested and state.phase == FLIGHT and state.phase_steps >= FREE_STEPS
-
-
-@wp.func
-def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
-    """Return whether the jump takes over again from turning in its flight: at contact, or shortly before landing."""
-    if robot.contacts > 0:
-        return True
-    if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:
-        return False
-    time_left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.gravity_magnitude)
-    return time_left < LANDING_TIME or robot.height < LANDING_HEIGHT
-
-
-@wp.func
-def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
-    """Return the initial state of turning during a jump's flight; the goal is level, with the heading of the jump.
-
-    The state keeps start and goal of the jump, which `begin_landing` needs.
-    """
-    new = AttitudeState()
-    new.jump_start = state.start
-    new.jump_goal = state.goal
-    new.goal_ground = state.goal_ground
-    new.max_height = state.max_height
-    return with_goal(new, robot.quat, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), state.heading))
-
-
-@wp.func
-def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
-    """Return the initial state of a jump after turning in its flight: in flight, past its apex.
-
-    Start, goal and heading are those of the jump that the turn interrupted.
-    """
-    new = JumpState()
-    new.phase = FLIGHT
-    new.start = state.jump_start
-    new.goal = state.jump_goal
-    new.goal_ground = state.goal_ground
-    new.heading = yaw_of(state.goal)
-    new.max_height = state.max_height
-    new.apex_passed = 1
-    new.steps = 1
     return new

@@ -57,7 +57,6 @@ def test_latest_or_new_resumes_the_run_that_it_started(tmp_path, capsys):
         (["--init-policy", "vertical_jump"], "init_policy: observation "),
         (["--init-policy", "slippery_jump", "--ppo.symmetry", "off"], "pass --ppo.hidden 512 256 256"),
         (["--init-policy", "slippery_jump", "--resume", "latest"], "not both"),
-        (["--init-policy", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not supported"),
     ],
 )
 def test_refuses_unsuitable_initial_policies(more, message, capsys, tmp_path):

@@ -9,7 +9,7 @@ from cli_helpers import run as command
 from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import parse_train
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
-from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.overlay import RobotOverlay
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
 SAVED = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
@@ -29,7 +29,7 @@ def begun(tmp_path_factory):
     """Folder of a training run with settings that differ from the defaults."""
     root = tmp_path_factory.mktemp("logs")
     springs = root / "springs.json"
-    with_springs(600.0, 0.1).save(springs)
+    RobotOverlay({"spring_stiffness": (600.0,), "spring_length": (0.1,)}).save(springs)
     cli.main(["train", "vertical-jump", *HERE, *SMALL, *SAVED, "--robot", str(springs), "--log-root", str(root)])
     springs.unlink()  # the run saves its robot
     (folder,) = (root / "vertical-jump").iterdir()
@@ -83,7 +83,7 @@ def test_session_settings_are_not_restored(run):
 
 
 def test_robot_flag_overrides_the_robot_of_the_run(run, tmp_path):
-    with_springs(700.0, 0.1).save(tmp_path / "stiffer.json")
+    RobotOverlay({"spring_stiffness": (700.0,), "spring_length": (0.1,)}).save(tmp_path / "stiffer.json")
     overridden = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])[0]
     for recipe, stiffness in ((parse_train(["vertical-jump", "--resume", str(run)])[0], 600.0), (overridden, 700.0)):
         saved = recipe.make_env(2, 0, "cpu").config()["robot"]

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli.main import main
-from jumper_warp.identification.actuators import COLUMNS, described_constants
 from jumper_warp.identification.motions import load_motion
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
-from synthetic_bench import synthetic_bench
 
 PARAMS = ["--params", "latency,offsets"]
 
@@ -91,23 +89,12 @@ def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
     assert "motions 1 (0_hung_chirp) and 5 (0_hung_chirp) are the same recording: give it once" in error
 
 
-def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
-    bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
-    rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
-    (tmp_path / "bench.csv").write_text("".join(f"{','.join(map(str, row))}\n" for row in (COLUMNS, *rows)))
-    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path), "--json"])
-    printed = capsys.readouterr().out
-    assert printed == (tmp_path / "actuator.json").read_text()
-    friction = json.loads(printed)["constants"]["friction"]
-    assert friction["value"] == pytest.approx(0.3, abs=0.02) and friction["identified"]
-
-
 @pytest.mark.parametrize(
     ("args", "words"),
     [
         ([], "recorded motions come first"),
         (["nowhere.npz"], "nowhere.npz"),
-        (["."], "no npz, csv or parquet file"),
+        (["."], "no npz or csv file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
         (["x.npz", "--exclude", "kd,kq"], "unknown parameter 'kq' to exclude"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),

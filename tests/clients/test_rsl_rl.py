@@ -8,7 +8,7 @@ import pytest
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from jumper_warp.cli import evaluate, export, play, train
+from jumper_warp.cli import evaluate, export, play
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.policies.policy import Policy
@@ -70,18 +70,16 @@ def test_folder_means_its_newest_checkpoint(trained):
     assert not torch.equal(newest.layers[0][0], first.layers[0][0])
 
 
-def test_checkpoint_of_the_command_line_is_exported_evaluated_and_played(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    args = "vertical-jump --trainer rsl-rl --num-envs 8 --max-iterations 1 --log-root runs --device cpu --ppo.hidden 16"
-    run = train.run(args.split()).folder
-    for source in (run, run / "model_0.pt"):
+def test_checkpoint_is_exported_evaluated_and_played(trained, tmp_path):
+    run = trained[0]
+    for source in (run, run / "model_1.pt"):
         assert export.export(export.ExportCfg((str(source),), overwrite=True)) == run / "policy"
     exported = Policy.load(run / "policy")
     obs = torch.randn(4, len(exported.mean))
-    assert torch.equal(exported.act(obs), Policy.load(run / "model_0.pt").act(obs))
-    evaluate.run([str(run), "--num-jumps", "2", "--device", "cpu", "--out", "metrics"], [])
+    assert torch.equal(exported.act(obs), Policy.load(run / "model_1.pt").act(obs))
+    evaluate.run([str(run), "--num-jumps", "2", "--device", "cpu", "--out", str(tmp_path / "metrics")], [])
     assert json.loads((tmp_path / "metrics" / "metrics.json").read_text())
-    play.run([str(run / "model_0.pt"), "--device", "cpu", "--out", "film"], [])
+    play.run([str(run / "model_1.pt"), "--device", "cpu", "--out", str(tmp_path / "film")], [])
     assert any((tmp_path / "film").glob("*.rrd"))
 
 

@@ -14,7 +14,7 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.gym import env_id
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.learner import STATISTICS
-from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.rl.training_run import LEARNING, PERF
 from jumper_warp.tasks.randomization import RandomizationCfg
 from toy_task import SMALL
@@ -278,7 +278,7 @@ def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):
 def test_rsl_rl_logs_the_keys_of_this_packages_trainer(tmp_path, one_thread):
     adapter = RslRlVecEnv(jumper(4), metrics_every=SMALL.num_steps)
     adapter.reset()
-    train_rsl_rl(adapter, SMALL, 2, save_interval=1, seed=0, folder=tmp_path)
+    OnPolicyRunner(adapter, rsl_rl_config(SMALL, 1, 0), log_dir=str(tmp_path), device="cpu").learn(2)
     assert (tmp_path / "model_1.pt").exists()
     events = EventAccumulator(str(tmp_path))
     events.Reload()

@@ -18,8 +18,8 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.metrics import measure
-from support.momentum import momentum, rotational_inertia
-from support.pinocchio_model import build_pinocchio
+from momentum_oracle import momentum, rotational_inertia
+from pinocchio_model import build_pinocchio
 
 N = 64
 DEG = np.pi / 180.0

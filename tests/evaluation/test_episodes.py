@@ -138,11 +138,6 @@ def test_policy_of_any_task_is_recorded(policy, tmp_path, capsys):
     assert "time limit" in printed.out and "start goal" in printed.out and "beyond" not in printed.err
 
 
-def test_command_beyond_those_of_resets_is_named_in_one_line(policy, tmp_path, capsys):
-    play.run([policy, *"--seconds 0.1 --device cpu --command 9 0.1 --out".split(), str(tmp_path)], [])
-    assert "jumper: beyond the training of any-task: goal[0] 9 (resets sampled -" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("marker", ["goal", "peak_tilt"])
 def test_metrics_and_goal_are_of_the_state_at_the_end_of_each_episode(marker):
     """The first world's episode ends after a step; then its state is that of another episode."""

@@ -16,8 +16,8 @@ from jumper_warp.sim.apex import EXTEND, HOLD, RAMP
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from landing_helpers import OPEN_LOOP_APEX
+from leg_springs import STAND, transversal_command
 from randomization_helpers import read
-from support.open_loop import STAND, transversal_command
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -37,7 +37,7 @@ def simulated_apex(kp, kd):
     sim = Simulation(1, motors=motors, command_filter=vertical_jump_filter(), visuals=False, device="cpu")
     heights = []
     for tick in range(STAND + RAMP + HOLD + EXTEND):
-        sim.target.assign((np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick))[:, None].astype(np.float32))
+        sim.target.assign((np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick, 135.0))[:, None].astype(np.float32))
         sim.step()
         heights.append(sim.joint_q()[0, 2])
     return max(heights[STAND + RAMP + HOLD :])

@@ -155,7 +155,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_p
 def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     args = benchmark_training.Args(
         envs=(8,), train_envs=16, steps=4, repeats=1, iterations=1, num_steps=8, out=tmp_path, device="cpu",
-        variants=("eager",),
+        eager=True,
     )  # fmt: skip
     values = benchmark_training.main(args)
     assert values["ppo_steps_per_s_eager"] > 0.0

@@ -16,7 +16,7 @@ from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.policy import load_policy
-from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from metric_helpers import saved_metrics
 from support import policy_results
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_payload_keeps_springs_and_moves_the_mass_towards_the_centre_of_the_base():
     base, payload = 6.43, 3.0  # [kg]; the payload is at the base's origin
-    robot = payload_overlay(with_springs(600.0, 0.2), payload).robots()
+    robot = payload_overlay(RobotOverlay({"spring_stiffness": (600.0,), "spring_length": (0.2,)}), payload).robots()
     share = base / (base + payload)
     np.testing.assert_allclose(robot.base_mass, [[base + payload]])
     np.testing.assert_allclose(robot.base_com, [[-0.0094 * share, 0.0, 0.0111 * share]])  # [m]
@@ -106,7 +106,7 @@ def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
     assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "slippery_jump"]
     assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
     assert all((POLICIES.parents[1] / test["command"].split()[0]).is_file() or test["command"].startswith("jumper ")
-               for test in TESTS.values())  # fmt: skip
+               for test in TESTS.values() if "command" in test)  # fmt: skip
 
 
 # ---------------------------------------------------------------- the experiment

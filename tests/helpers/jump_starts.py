@@ -7,10 +7,10 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from collision_kernels import make_collision_kernel
 from columns import LIN_VEL, POS
 from jump_helpers import START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
-from jumper_warp.kernels.collision.robot import collision_kernel
 from solver_helpers import Reference, States, paw_joint
 
 PLACES = ("horizontal-jump", "omnidirectional-jump")  # Names of the tasks of jumps to landing positions
@@ -98,7 +98,7 @@ def collision_flags(env: Env) -> np.ndarray:
     flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
     robot = env.sim.dynamics.robot
     inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
-    wp.launch(collision_kernel, env.num_envs, inputs, [flags, clearance], device="cpu")
+    wp.launch(make_collision_kernel(), env.num_envs, inputs, [flags, clearance], device="cpu")
     return flags.numpy()
 
 

@@ -11,7 +11,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
 
 OPEN_LOOP_APEX = 1.0748
-"""[m] Apex of the nominal robot in `open_loop_jump.py` at 18 N m, without latency; the paper's robot: 1.075 m."""
+"""[m] Apex of the nominal robot's open-loop jump at 18 N m, without latency; the paper's robot: 1.075 m."""
 
 
 def still_policy(name):

@@ -11,7 +11,7 @@ from columns import ANG_VEL, COORDS, DOFS, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, PO
 from jumper_warp.robot.description import LEGS, load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 BODIES = 21  # links of a robot
 KNEES = np.array([5 * leg + joint for leg in range(4) for joint in (2, 4)])

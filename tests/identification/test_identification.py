@@ -13,13 +13,14 @@ from jumper_warp.identification.initial_states import paw_positions, stance, une
 from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, ratio, total_mass, weighed_mass
-from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
+from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import standing_configuration
 from jumper_warp.utils.errors import InputError
+from recorded_motions import simulate_plan
 
 DEGREE = math.pi / 180.0  # [rad]
 
@@ -43,7 +44,7 @@ def test_replay_matches_simulation_of_a_robot_with_all_parameters_changed(replay
     parameters = jumper_parameters()
     robots = parameters.robots(sample_z(parameters))
     plan = sample_plan(kind, np.random.default_rng(1), seconds=0.6)
-    replayed, simulated = replay_plan(replay, plan, robots), simulate_plan(plan, robots=robots)
+    replayed, simulated = replay_plan(replay, plan, robots), simulate_plan(plan, robots)
     assert replayed.valid.all() and np.ptp(replayed.angle[:, 1, 0]) > 2.0 * DEGREE  # FL_outer moves
     np.testing.assert_allclose(replayed.angle, simulated.angle, atol=0.01 * DEGREE)
     np.testing.assert_allclose(replayed.rate, simulated.rate, atol=0.02)  # [rad/s]

@@ -64,7 +64,7 @@ def assert_same(loaded, motion):
     assert (loaded.name, loaded.base, loaded.torque_limit, loaded.gains) == ("walk", "fixed", 12.0, "jumping")
 
 
-def test_load_motion_reads_npz_csv_and_parquet_and_overrides_settings(tmp_path):
+def test_load_motion_reads_npz_and_csv_and_overrides_settings(tmp_path):
     motion = random_motion()
     motion.save(tmp_path / "walk.npz")
     assert_same(load_motion(tmp_path / "walk.npz"), motion)
@@ -72,10 +72,6 @@ def test_load_motion_reads_npz_csv_and_parquet_and_overrides_settings(tmp_path):
     write_csv(tmp_path / "walk.csv", columns, {"base": "fixed", "torque_limit": 12.0})
     assert_same(load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT), motion)
     assert load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT, base="free").base == "free"
-    pyarrow = pytest.importorskip("pyarrow")
-    pyarrow.parquet = pytest.importorskip("pyarrow.parquet")
-    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "walk.parquet")
-    assert_same(load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT), motion)
 
 
 @pytest.mark.parametrize(
@@ -120,46 +116,12 @@ def test_a_cell_of_a_csv_file_is_a_plain_number(tmp_path, cell):
         load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
 
 
-@pytest.mark.parametrize("kind", ["timestamp", "duration"])
-@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
-def test_times_of_a_parquet_file_have_the_unit_of_their_type(tmp_path, kind, unit):
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
+def test_times_in_nanoseconds_need_their_unit(tmp_path):
     columns = table_of(random_motion())
-    del columns["time [ms]"]
-    per_second = {"ms": 1.0e3, "us": 1.0e6, "ns": 1.0e9}[unit]
-    milliseconds = 4 * np.arange(ROWS)
-    counts = (milliseconds * int(per_second / 1.0e3)).astype(np.int64)
-    time = pyarrow.array(counts, pyarrow.int64()).cast(getattr(pyarrow, kind)(unit))
-    parquet.write_table(pyarrow.table({**columns, "time": time}), tmp_path / "walk.parquet")
-    motion = load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
-    np.testing.assert_allclose(motion.time, milliseconds * 1.0e-3, atol=1.0e-12)
-
-
-@pytest.mark.parametrize("name", ["time", "time [ns]"])
-def test_integer_times_need_their_unit(tmp_path, name):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    pyarrow = pytest.importorskip("pyarrow")
-    columns = table_of(random_motion())
-    del columns["time [ms]"]
-    counts = 4_000_000 * np.arange(ROWS)
-    parquet.write_table(pyarrow.table({name: counts, **columns}), tmp_path / "walk.parquet")
-    if name == "time":
-        with pytest.raises(InputError, match=r"time rises by 4e\+06 s a row: give its unit"):
-            load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
-    else:
-        motion = load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
-        np.testing.assert_allclose(motion.time, counts * 1.0e-9, atol=1.0e-12)
-
-
-@pytest.mark.parametrize("values", ["bool", "text", "timestamp"])
-def test_a_column_of_a_parquet_file_that_is_no_number_is_refused(tmp_path, values):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    pyarrow = pytest.importorskip("pyarrow")
-    columns = table_of(random_motion())
-    column = {"bool": ROWS * [True], "text": ROWS * ["1_0"], "timestamp": np.arange(ROWS).astype("datetime64[ns]")}[
-        values
-    ]
-    parquet.write_table(pyarrow.table({**columns, "position/x": column}), tmp_path / "walk.parquet")
-    with pytest.raises(InputError, match="all columns must hold numbers"):
-        load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT)
+    milliseconds = columns.pop("time [ms]")
+    write_csv(tmp_path / "walk.csv", {"time": 1.0e6 * milliseconds, **columns})
+    with pytest.raises(InputError, match=r"time rises by .* s a row: give its unit"):
+        load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
+    write_csv(tmp_path / "walk.csv", {"time [ns]": 1.0e6 * milliseconds, **columns})
+    motion = load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
+    np.testing.assert_allclose(motion.time, 1.0e-3 * milliseconds, atol=1.0e-12)

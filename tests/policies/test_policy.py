@@ -240,7 +240,6 @@ REFUSALS = {
     "block of three dimensions": (change_model(reshape_block), "the ONNX file cannot be read"),
     "name that is not UTF-8": (change_model(lambda m: m.MergeFromString(NOT_UTF8)), "the ONNX file cannot be read"),
     "layout of another type": (edit_config(lambda c: c["interface"].update(observation_layout=[])), "of another type"),
-    "number beyond float64": (edit_config(lambda c: c["interface"].update(policy_dt=10**400)), "401 digits"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",

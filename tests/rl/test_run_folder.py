@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.dumps import NonFiniteValue, load_dump
 from toy_task import SMALL, PushTask, push_cfg
@@ -14,7 +13,6 @@ ARRAYS = {"joint_q": np.zeros(43), "joint_qd": np.zeros(38), "action": np.zeros(
 ARRAYS |= {"observations": np.zeros(0)}
 FOUND = NonFiniteValue("rewards.tilt", float("nan"), 3, 21, ARRAYS, {"rewards": ["tilt"], "observations": []})
 LINE = "rewards.tilt is not finite (nan) in world 3 at step 21"
-TRAINERS = pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
 
 
 class FaultyTask(PushTask):
@@ -33,13 +31,12 @@ def cfg(tmp_path):
 def end_of(cfg, task):
     """Train, and return the code of the SystemExit that ends the training."""
     with pytest.raises(SystemExit) as end:
-        train(cfg, task, as_rsl_rl=RslRlVecEnv)
+        train(cfg, task)
     return end.value.code
 
 
-@TRAINERS
-def test_term_that_is_not_finite_is_named_once_and_dumped(cfg, trainer, capsys):
-    result = train(dataclasses.replace(cfg, trainer=trainer), FaultyTask, as_rsl_rl=RslRlVecEnv)
+def test_term_that_is_not_finite_is_named_once_and_dumped(cfg, capsys):
+    result = train(cfg, FaultyTask)
     path = result.folder / "non_finite" / "rewards.tilt.npz"
     lines = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
     assert lines == [f"{LINE}; jumper play --dump {path}"]
@@ -48,12 +45,10 @@ def test_term_that_is_not_finite_is_named_once_and_dumped(cfg, trainer, capsys):
     assert (header["iteration"], header["task"], header["config"]["train"]["seed"]) == (2, "push", 1)
 
 
-@TRAINERS
 @pytest.mark.parametrize("log_interval", [1, 10])
-def test_stop_on_nan_ends_with_a_checkpoint_of_that_iteration(cfg, trainer, log_interval):
-    cfg = dataclasses.replace(cfg, trainer=trainer, stop_on_nan=True, log_interval=log_interval, save_interval=100)
+def test_stop_on_nan_ends_with_a_checkpoint_of_that_iteration(cfg, log_interval):
+    cfg = dataclasses.replace(cfg, stop_on_nan=True, log_interval=log_interval, save_interval=100)
     assert end_of(cfg, FaultyTask) == f"jumper: --stop-on-nan: {LINE}"
     (folder,) = cfg.log_root.glob("push/*")
     assert (folder / "non_finite" / "rewards.tilt.npz").is_file()
-    last = "model_1.pt" if trainer == "rsl-rl" else f"{CHECKPOINTS}/iteration_000002.pt"
-    assert (folder / last).is_file()
+    assert (folder / CHECKPOINTS / "iteration_000002.pt").is_file()

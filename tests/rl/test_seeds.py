@@ -188,7 +188,6 @@ def test_name_of_a_run_is_in_its_folder_and_its_title(cfg):
     [
         ({"seeds": (1, 1)}, "seeds must be distinct"),
         ({"seeds": (1, -1)}, "seed must be in"),
-        ({"seeds": (1,), "trainer": "rsl-rl"}, "seeds are not supported"),
         ({"run_name": "a/b"}, "task, run_name and tags"),
         ({"tags": ("",)}, "task, run_name and tags"),
     ],

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
@@ -17,7 +18,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Scores
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import find_checkpoints
-from jumper_warp.rl.rsl_rl import train_rsl_rl
+from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.rl.training_run import TrainingRun
@@ -142,24 +143,10 @@ def test_hangup_is_ignored_if_it_was_before(cfg, monkeypatch):
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
-def test_training_runs_in_a_thread(cfg, trainer):
-    cfg = dataclasses.replace(cfg, trainer=trainer)
+def test_training_runs_in_a_thread(cfg):
     with ThreadPoolExecutor(1) as pool:
-        result = pool.submit(train, cfg, make_env, as_rsl_rl=RslRlVecEnv).result()
+        result = pool.submit(train, cfg, make_env).result()
     assert result.iteration == cfg.max_iterations
-
-
-def test_interrupted_training_with_rsl_rl_ends_with_a_checkpoint(cfg):
-    class SignallingTask(PushTask):
-        def step(self, action):
-            super().step(action)
-            if self.steps == 20:  # in the second iteration of 16 steps
-                os.kill(os.getpid(), signal.SIGTERM)
-
-    with pytest.raises(SystemExit, match="130"):
-        train(dataclasses.replace(cfg, trainer="rsl-rl", save_interval=100), SignallingTask, as_rsl_rl=RslRlVecEnv)
-    assert list(cfg.log_root.glob("push/*/model_1.pt"))
 
 
 def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
@@ -209,8 +196,6 @@ def test_each_rank_resumes_its_own_worlds(cfg):
         ({"max_iterations": 0}, "max_iterations must be a whole number of 1 to 1000000000, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
-        ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
-        ({"trainer": "shac"}, "trainer must be ppo or rsl-rl, got 'shac'"),
         ({"resume": ""}, "resume is empty"),
         ({"init_policy": ""}, "init_policy is empty"),
     ],
@@ -267,25 +252,13 @@ def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():
     assert not adapter.episode_length_buf.any()
 
 
-def test_train_with_rsl_rl_writes_model_and_config(cfg, tmp_path):
-    result = train(dataclasses.replace(cfg, trainer="rsl-rl", max_iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
-    assert (result.folder / "model_1.pt").exists()
-    assert (result.folder / CONFIG).exists()
-
-
-def test_time_limit_ends_a_training_with_rsl_rl_with_a_checkpoint(cfg):
-    cfg = dataclasses.replace(cfg, trainer="rsl-rl", max_seconds=1.0e-6, max_iterations=9)
-    result = train(cfg, make_env, as_rsl_rl=RslRlVecEnv)
-    assert result.iteration == 2  # the clock starts at the end of the first iteration
-    assert (result.folder / "model_1.pt").exists() and not (result.folder / "model_2.pt").exists()
-
-
 def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
     torch.manual_seed(0)
     env = PushTask(128)
     adapter = RslRlVecEnv(env, SMALL.num_steps)
     adapter.reset()
-    runner = train_rsl_rl(adapter, SMALL, iterations=30, save_interval=100, seed=0)
+    runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
+    runner.learn(30)
     env.reset()
     actor = runner.alg.get_policy().eval()
     with torch.inference_mode():

@@ -15,7 +15,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.assets import ASSETS
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 FILE = ASSETS / "jumper" / "jumper.xml"

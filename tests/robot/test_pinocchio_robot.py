@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from jumper_warp.robot.description import MOTOR_JOINTS, load_description
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
 

@@ -16,7 +16,7 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, leg_geometry, leg_geometry_array, standing_configuration
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
-from support.pinocchio_model import build_pinocchio
+from pinocchio_model import build_pinocchio
 
 LEGS = ("FL", "FR", "BL", "BR")
 FRONT = np.array([1, 1, -1, -1])  # sign of x by leg

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from experiments.dynamics_agreement import differences, jumper_quantities, pinocchio_quantities, random_states
-from jumper_warp.kernels.kinematics.inverse import LegLimits, inverse_kinematics_kernel, paws_kernel
+from dynamics_oracle import differences, jumper_quantities, pinocchio_quantities, random_states
+from jumper_warp.kernels.kinematics.inverse import LegLimits
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.folder import read_robot, read_urdf, robot_of, table_of, write_robot
@@ -16,6 +16,7 @@ from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues, described
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
+from leg_kernels import make_inverse_kernel, make_leg_kernel
 from odd_robot import odd_table, set_value
 
 
@@ -49,9 +50,10 @@ def test_inverse_kinematics_bring_paws_beyond_their_ankles_to_their_targets():
     sim = Simulation(1, robot=overlay, device="cpu", visuals=False)
     geometry = sim.dynamics.robot.geometry
     angles = random_states(20, 1, overlay.description)["angles"].T
-    paws = wp.zeros((4, 20), dtype=wp.vec3, device="cpu")
-    motors = wp.array(angles, dtype=float, device="cpu")
-    wp.launch(paws_kernel, (4, 20), inputs=[geometry, motors], outputs=[paws], device="cpu")
+    package = "jumper_warp.kernels"
+    paws, *rest = (wp.zeros((4, 20), dtype=kind, device="cpu") for kind in (wp.vec3, wp.vec2, wp.vec3, wp.vec2))
+    inputs = [geometry, wp.array(angles, dtype=float, device="cpu"), wp.zeros((4, 20), dtype=wp.vec3, device="cpu")]
+    wp.launch(make_leg_kernel(package), (4, 20), inputs, [paws, *rest], device="cpu")
     oracle = pinocchio_quantities(overlay.robots(), random_states(20, 1, overlay.description), overlay.description)
     np.testing.assert_allclose(paws.numpy(), oracle["paw_position"].transpose(1, 0, 2), atol=1.0e-6)
     limits = LegLimits()
@@ -59,13 +61,7 @@ def test_inverse_kinematics_bring_paws_beyond_their_ankles_to_their_targets():
         setattr(limits, f"{name}_lower", -1.0 if name != "sum" else 0.0)
         setattr(limits, f"{name}_upper", 2.5 if name != "sum" else 4.5)
     found = wp.zeros((12, 20), dtype=float, device="cpu")
-    rest = [
-        wp.zeros(shape, dtype=kind, device="cpu")
-        for shape, kind in (((8, 20), float), ((4, 20), int), ((4, 20), float))
-    ]
-    base = [wp.zeros(20, dtype=wp.vec3, device="cpu"), wp.zeros(20, dtype=wp.quat, device="cpu")]
-    inputs = [geometry, limits, *base, paws, 0]
-    wp.launch(inverse_kinematics_kernel, (4, 20), inputs=inputs, outputs=[found, *rest], device="cpu")
+    wp.launch(make_inverse_kernel(package), (4, 20), [geometry, limits, paws], [found], device="cpu")
     np.testing.assert_allclose(found.numpy(), angles, atol=2.0e-5)
 
 

@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 
 from jumper_warp.robot.model import load_description
-from jumper_warp.robot.overlay import with_springs
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation, motor_values
+from pinocchio_model import build_pinocchio
 from solver_helpers import Flight, Reference, bare_model, random_states
-from support.pinocchio_model import build_pinocchio
 
 STIFFNESS, LENGTH = 1000.0, 0.17  # [N/m], [m]
 KNEES = [[f"{leg}_{bar}_knee" for bar in ("outer", "inner")] for leg in ("FL", "FR", "BL", "BR")]
@@ -88,8 +88,9 @@ def test_springs_move_alike_on_both_solvers(stiffness):
     # in zero gravity with motors of kp 0, the springs move the legs
     angles = {}
     for solver in ("jumper", "mujoco"):
+        robot = RobotOverlay({"spring_stiffness": (stiffness,), "spring_length": (LENGTH,)})
         sim = Simulation(1, solver=solver, ground=None, gravity=0.0, dt=1.0 / 1920.0, visuals=False, device="cpu",
-                         robot=with_springs(stiffness, LENGTH))  # fmt: skip
+                         robot=robot)  # fmt: skip
         sim.motors.kp.fill_(0.0)
         for _ in range(12):
             sim.step()

@@ -7,7 +7,7 @@ from columns import ANG_VEL, XY, Z
 from jumper_warp.robot.gravity import MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation
-from support.momentum import momentum
+from momentum_oracle import momentum
 
 N = 2  # worlds
 STEPS = 45  # policy steps, 0.75 s

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from collision_kernels import make_collision_kernel
 from columns import COORDS, MOTOR_DOFS, XY, X, Y, Z
 from jumper_warp.envs.env import Env
-from jumper_warp.kernels.collision.robot import SHANK_GROUND, collision_kernel
+from jumper_warp.kernels.collision.robot import SHANK_GROUND
 from jumper_warp.kernels.dynamics.contact import BlockLaw, PawContact, block_velocity, push_on_block
 from jumper_warp.kernels.scalar import vec3
 from jumper_warp.kernels.terrain.ground import Ground, block_normal, ground_distance, surface, world_ground
@@ -269,7 +270,7 @@ def test_shank_in_a_block_is_a_collision():
     flags, clearance = wp.zeros(2, dtype=int, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
     robot = sim.solver.dynamics.robot
     inputs = [robot.geometry, robot.ground, sim.state.joint_q, COORDS, 0.0]
-    wp.launch(collision_kernel, 2, inputs=inputs, outputs=[flags, clearance], device="cpu")
+    wp.launch(make_collision_kernel(), 2, inputs=inputs, outputs=[flags, clearance], device="cpu")
     assert flags.numpy()[0] & int(SHANK_GROUND)
     assert flags.numpy()[1] == 0
 

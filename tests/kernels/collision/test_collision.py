@@ -7,6 +7,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coal_shapes import box, capsule, coal_distance
+from collision_kernels import make_collision_kernel
 from columns import POS, QUAT, Z
 from jumper_warp.kernels.collision import robot as collision_module
 from jumper_warp.kernels.kinematics import geometry as geometry_module
@@ -74,7 +75,7 @@ def collide(pos, quat_xyzw, motors_deg, margin=1.0, heights=None, module=collisi
     legs = leg_array(importlib.import_module(f"{package}.kinematics.geometry"))
     surface = make_ground(importlib.import_module(f"{package}.terrain.ground"), heights)
     inputs = [legs, surface, wp.array(joint_q.ravel(), dtype=wp.float32, device="cpu"), 43, margin]
-    wp.launch(module.collision_kernel, len(joint_q), inputs=inputs, outputs=[flags, clearance], device="cpu")
+    wp.launch(make_collision_kernel(package), len(joint_q), inputs=inputs, outputs=[flags, clearance], device="cpu")
     return flags.numpy(), clearance.numpy()
 
 

@@ -3,9 +3,9 @@ import pinocchio as pin
 import pytest
 import warp as wp
 
+from collision_kernels import make_collision_kernel
 from jump_starts import ANKLE
 from jumper_warp.envs.skill import TaskRuntime
-from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.mdp.env import SkillSettings
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.kernels.mdp.view import RobotArrays, load_view
@@ -196,7 +196,7 @@ def test_collision_flags_of_all_legs_combined_equal_those_of_the_whole_robot(sim
     track(robot, sim, ground=ground)
     flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
     geometry = sim.dynamics.robot.geometry
-    wp.launch(collision_kernel, n, [geometry, ground, poses, 43, 0.0], [flags, clearance], device="cpu")
+    wp.launch(make_collision_kernel(), n, [geometry, ground, poses, 43, 0.0], [flags, clearance], device="cpu")
     by_leg, expected = robot.collisions.numpy(), flags.numpy()
     np.testing.assert_array_equal(np.bitwise_or.reduce(by_leg, axis=0), expected)
     np.testing.assert_array_equal(paw_view(robot, sim)[3], expected)
@@ -216,7 +216,7 @@ def test_links_closer_than_self_collision_margin_count_as_touching(sim, poses):
     flags, clearance = (wp.zeros(n, dtype=dtype, device="cpu") for dtype in (int, float))
     model = sim.dynamics.robot
     inputs = [model.geometry, model.ground, robot.joint_q, 43, 2.0 * margin]
-    wp.launch(collision_kernel, n, inputs, [flags, clearance], device="cpu")
+    wp.launch(make_collision_kernel(), n, inputs, [flags, clearance], device="cpu")
     near, far = clearance.numpy() < margin - 1e-5, clearance.numpy() > margin + 1e-5
     collides = np.bitwise_or.reduce(robot.collisions.numpy(), axis=0) != 0
     assert collides[near].all() and not collides[far].any()

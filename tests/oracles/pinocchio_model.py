@@ -1,7 +1,7 @@
 """The robot in Pinocchio: an independent reference for kinematics and rigid-body dynamics.
 
 `build_pinocchio()` returns the described robot or that of an overlay, without ground, friction, knee damping and
-springs. `experiments/dynamics_agreement.py` compares the project's dynamics with it.
+springs. `dynamics_oracle.py` compares the project's dynamics with it.
 """
 
 from __future__ import annotations

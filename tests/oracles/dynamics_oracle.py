@@ -1,17 +1,11 @@
-"""Compare accelerations, paw positions and paw Jacobians with Pinocchio, and write the differences as metrics.
+"""Accelerations, paw positions and paw Jacobians of random flight states, by this project's dynamics and by Pinocchio.
 
-    python experiments/dynamics_agreement.py --robot assets/jumper/leg_springs.json --out outputs/dynamics_agreement
-
-The states are random flight states with random motor torques. Both robots have the masses and armatures of the
-description or of an overlay, without ground, friction, knee damping and springs. The project's dynamics compute in
-double precision with masses that Newton's model stores in single precision, so seven digits can agree. A relative
-difference is the difference over the largest value of the same state.
+Both robots have the same masses and armatures, without ground, friction, knee damping and springs. The project's
+dynamics compute in double precision with masses that Newton's model stores in single precision, so seven digits can
+agree. A relative difference is the difference over the largest value of the same state.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -19,13 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.model import MOTOR_DOFS, build_model
-from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.dynamics import JumperDynamics
-from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import configure_device
-from support.pinocchio_model import build_pinocchio
-from support.scripts import OutputArgs, report, run_script
+from pinocchio_model import build_pinocchio
 
 
 def random_motors(description: RobotDescription, n: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
@@ -44,17 +34,13 @@ def random_motors(description: RobotDescription, n: int, rng: np.random.Generato
     return np.concatenate([lateral_angle, outer_angle, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
 
 
-UNITS = {
-    "base_acceleration": "m/s^2", "base_angular_acceleration": "rad/s^2", "joint_acceleration": "rad/s^2",
-    "paw_position": "m", "paw_jacobian": "m",
-}  # fmt: skip
-"""Unit by compared quantity, first axis states: acceleration (3,) and angular acceleration (3,) of the body's origin,
-body axes; accelerations of the motors (12,); positions of the paws' centres (4, 3), body axes; their Jacobians
-(4, 3, 3) with respect to the rates of the leg's motors, per rad."""
 MARGIN = 0.35  # [rad] Distance of the motor angles from the stops; a stretched leg is singular
 DT = 1.0e-6  # [s] Time step over which the change of velocity gives the acceleration
 States = dict[str, np.ndarray]  # Keys and shapes: `random_states`
-Quantities = dict[str, np.ndarray]  # Keys: those of UNITS
+Quantities = dict[str, np.ndarray]
+"""Arrays by name, first axis states: base_acceleration (3,) [m/s^2] and base_angular_acceleration (3,) [rad/s^2] of the
+body's origin, body axes; joint_acceleration (12,) [rad/s^2] of the motors; paw_position (4, 3) [m], body axes;
+paw_jacobian (4, 3, 3) [m/rad] with respect to the rates of the leg's motors."""
 
 
 def random_states(n: int, seed: int, robot: RobotDescription | None = None) -> States:
@@ -77,7 +63,7 @@ def jumper_quantities(values: RobotValues, states: States, robot: RobotDescripti
     """Compute accelerations, paw positions and Jacobians in given states by this project's dynamics.
 
     The dynamics only advance states: accelerations are changes of velocity over one tiny step, DT. The robot is the
-    first one of `values`. Keys: those of UNITS.
+    first one of `values`.
     """
     n = len(states["angles"])
     model = build_model(n, ground=None, visuals=False, device="cpu", robot=values, description=robot)
@@ -151,7 +137,7 @@ def pinocchio_quantities(values: RobotValues, states: States, robot: RobotDescri
     """Compute accelerations, paw positions and Jacobians in given states by Pinocchio.
 
     Its base velocity v is that of the body's origin, in body axes; with the spin w, the origin's acceleration in these
-    axes is dv/dt + w x v. The robot is the first one of `values`. Keys: those of UNITS.
+    axes is dv/dt + w x v. The robot is the first one of `values`.
     """
     oracle = build_pinocchio(robot, values)
     rows = []
@@ -176,15 +162,6 @@ def pinocchio_quantities(values: RobotValues, states: States, robot: RobotDescri
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
 
-@dataclass(frozen=True)
-class Args(OutputArgs):
-    """Flags of the comparison of dynamics with Pinocchio."""
-
-    robot: Path | None = None  # Folder of a robot, or overlay (docs/reference/overlays.md; default: the Jumper)
-    states: int = 200  # Number of random states
-    seed: int = 0  # Seed of the states
-
-
 def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """Compare arrays of one quantity: return the largest difference over all states, absolute and relative.
 
@@ -193,24 +170,3 @@ def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """
     size, difference = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, ours - expected))
     return float(difference.max()), float((difference / size).max())
-
-
-def main(args: Args) -> dict:
-    """Compare accelerations, paw positions and paw Jacobians with Pinocchio, and return the metrics."""
-    configure_device("cpu")
-    folder = output_dir("dynamics_agreement", args.out)
-    overlay = RobotOverlay({}) if args.robot is None else load_overlay(args.robot)
-    values, robot = overlay.robots(), overlay.description
-    states = random_states(args.states, args.seed, robot)
-    ours = jumper_quantities(values, states, robot)
-    expected = pinocchio_quantities(values, states, robot)
-    metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
-    for name, unit in UNITS.items():
-        difference, relative = differences(ours[name], expected[name])
-        metrics |= {f"{name}_difference [{unit}]": difference, f"{name}_relative_difference": relative}
-    keys = [f"{name}_relative_difference" for name in UNITS]
-    return report(args, folder, metrics, f"Dynamics of {args.states} random states against Pinocchio", keys)
-
-
-if __name__ == "__main__":
-    run_script(main, Args)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.utils.metrics import Metrics, largest, mean
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
@@ -56,32 +53,3 @@ def _links(sim: Simulation) -> LinkStates:
     com = pose[..., :3] + rotate(pose[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
     arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
     return LinkStates(mass, inertia, pose[..., 3:], arm, twist)
-
-
-@dataclass
-class MomentumRecorder:
-    """Recorder of the angular momentum of all robots; call the object after every policy step."""
-
-    env: Env  # The recorded `jumper_warp.envs.env.Env`
-    angular: list[np.ndarray] = field(default_factory=list)  # [kg m^2/s] (num_envs, 3) per policy step, world axes
-
-    def __call__(self, *_: object) -> None:
-        """Append the present angular momentum about the COM."""
-        self.angular.append(momentum(self.env.sim)[1])
-
-    def metrics(self, diverged: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return metrics of the angular momentum, which should stay 0, and of the rotation that results from it.
-
-        Diverged robots are left out.
-        diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
-        """
-        drift = np.array(self.angular)[:, ~diverged]
-        over = "turns that did not diverge"
-        turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
-        size = np.linalg.norm(drift, axis=-1)
-        turn = np.degrees(np.linalg.norm(turned, axis=-1))
-        return {
-            "angular_momentum_max_nm_s": largest(size.max(axis=0), over),
-            "angular_momentum_at_end_mean_nm_s": mean(size[-1], over),
-            "turn_by_drift_mean_deg": mean(turn, over), "turn_by_drift_max_deg": largest(turn, over),
-        }  # fmt: skip
