@@ -135,7 +135,9 @@ LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 1 --ppo
 LAPTOP_WALK = f"{NOMINAL} --num-envs 512 --ppo.desired-kl 0.02 --ppo.minibatches 4"
 # Numbers of iterations in presets are those of 330, 650 and 1,110 s at 20,000 steps per second.
 
-UP, AHEAD, MARS, PRINTED = (f"jumper_warp.tasks.jump.{name}:" for name in ("vertical", "horizontal", "mars", "paper"))
+UP, AHEAD, STANDING, MARS, PRINTED = (
+    f"jumper_warp.tasks.jump.{name}:" for name in ("vertical", "horizontal", "standing", "mars", "paper")
+)
 WALK = "jumper_warp.tasks.velocity"
 
 TASKS: dict[str, TaskEntry] = {
@@ -146,11 +148,14 @@ TASKS: dict[str, TaskEntry] = {
         },
     ),
     "horizontal-jump": TaskEntry(
-        f"{AHEAD}horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",), about="jump to a place in any direction",
+        f"{AHEAD}horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",), about="jump to a place ahead",
         presets={"laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --max-iterations 400"},
     ),
-    "horizontal-jump-sighted": TaskEntry("jumper_warp.tasks.jump.crouching:horizontal_jump_sighted", PLACES,
-                                         about="jump off and onto blocks"),
+    "horizontal-jump-sighted": TaskEntry(f"{AHEAD}horizontal_jump_sighted", PLACES, about="jump off and onto blocks"),
+    "vertical-jump-standing": TaskEntry(f"{STANDING}vertical_jump_standing", HEIGHTS, max_iterations=6000,
+                                        about="stand, and jump to a height"),
+    "horizontal-jump-standing": TaskEntry(f"{STANDING}horizontal_jump_standing", PLACES, max_iterations=6000,
+                                          about="stand, and jump in any direction, also on slippery ground"),
     "vertical-jump-mars": TaskEntry(f"{MARS}vertical_jump_mars", ON_MARS, ("Olympus-Vertical-Jump-Mars",),
                                     about="jump to a height, Mars"),
     "vertical-jump-mars-loose": TaskEntry(f"{MARS}vertical_jump_mars_loose", ON_MARS, about="jump up to 3.6 m, Mars"),

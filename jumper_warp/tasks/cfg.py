@@ -312,10 +312,6 @@ class TaskCfg(Copyable):
             raise InputError(f"{self.name} has no {section} term {sorted(unknown)[0]!r}")
         return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in terms)})
 
-    def without(self, section: str, *names: str) -> TaskCfg:
-        """Return a copy of the task without these terms; section: "rewards", "terminations" or "events"."""
-        return replace(self, **{section: tuple(term for term in getattr(self, section) if term.name not in names)})
-
     def without_noise(self) -> TaskCfg:
         """Return a copy of the task with observation noise 0 for actor and critic; delays stay."""
         exact = {g: tuple(term.replace(noise=0.0) for term in getattr(self.observations, g)) for g in self.groups}

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.jump.cfg import GroundCfg
-from jumper_warp.tasks.jump.crouching import crouching_horizontal_jump, crouching_vertical_jump
+from jumper_warp.tasks.jump.cfg import GroundCfg, cross_levels
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
-from jumper_warp.tasks.jump.horizontal import NEAREST, level
-from jumper_warp.tasks.jump.vertical import heights
+from jumper_warp.tasks.jump.horizontal import NEAREST, horizontal_jump, level
+from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.tasks.units import DEG
 
@@ -35,7 +34,7 @@ def mars_motors(lateral_torque: float) -> MotorCfg:
 
 def vertical_jump_mars() -> TaskCfg:
     """Return the task of a vertical jump on Mars with the command filter of the vertical jump on Earth."""
-    task = crouching_vertical_jump()
+    task = vertical_jump()
     task = replace(
         task,
         name="vertical-jump-mars",
@@ -49,7 +48,8 @@ def vertical_jump_mars() -> TaskCfg:
         "terminations", moved_away={"distance": 0.30 * FARTHER}, wrong_height={"tolerance": 0.10 * FARTHER},
         tilted={"angle": 40.0 * DEG},
     )  # fmt: skip
-    task = task.without("terminations", "second_takeoff")  # a bounce must not end episodes early in training
+    ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
+    task = replace(task, terminations=ends)  # a bounce must not end episodes early in training
     descent_tilt = RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG)  # long flights amplify slow rotation
     lifted_again = RewardTerm(rewards.lifted_again, -30.0, threshold=0.0)  # in place of `paws_down`
     terms = (lifted_again if term.func is rewards.paws_down else term for term in task.rewards)
@@ -77,19 +77,22 @@ def vertical_jump_mars_loose() -> TaskCfg:
 
 def horizontal_jump_mars() -> TaskCfg:
     """Return the task of a horizontal jump on Mars, on level ground, with the command filter of the jump on Earth."""
-    reaches = (((0.5, 1.3), 0.1), ((1.0, 1.85), 0.2), ((1.4, 2.6), 0.3), ((2.0, 3.75), 0.3), ((3.0, 4.75), 0.3))
-    task = crouching_horizontal_jump((NEAREST, *(level(*reach) for reach in reaches)))
+    task = horizontal_jump()
     settings = replace(task.reset.settings, highest_apex=2.5, takeoff_angle=(35.0, 70.0), ground=GroundCfg())
     task = replace(
         task,
         name="horizontal-jump-mars",
         gravity=MARS,
         motors=mars_motors(12.0),
+        levels=cross_levels(
+            (NEAREST, level((0.5, 1.3), 0.1), level((1.0, 1.85), 0.2), level((1.4, 2.6), 0.3), level((2.0, 3.75), 0.3),
+             level((3.0, 4.75), 0.3)), STARTS,
+        ),
         reset=replace(task.reset, settings=settings),
         evaluation=PlaceEvaluation(
             (0.5, 4.2), success_range=(0.5, 3.9), default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))
         ),
-    )
+    )  # fmt: skip
     task = replace(task, curriculum=task.curriculum.replace(tolerance=0.10 * FARTHER))
     task = task.with_terms(
         "terminations", predicted_miss={"tolerance": 0.55 * FARTHER}, missed_goal={"tolerance": 0.50 * FARTHER},
