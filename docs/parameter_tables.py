@@ -27,7 +27,7 @@ PAGES = tuple(
 )
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.DOTALL)
 TASKS = (
-    "vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted", "omnidirectional-jump",
+    "vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "vertical-jump-standing", "horizontal-jump-standing",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
     "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
 )  # fmt: skip

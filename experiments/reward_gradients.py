@@ -32,7 +32,7 @@ FRACTION = 0.97  # Of the policy's actions, so that none is at its limit, where 
 class Args(DeviceArgs):
     """Flags of the comparison."""
 
-    policies: tuple[str, ...] = ("vertical_jump", "slippery_jump", "walking_flat", "attitude")  # Shipped policies
+    policies: tuple[str, ...] = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude")  # Shipped policies
     num_envs: int = 64  # Number of windows of each policy
     steps: int = 10  # Policy steps of a window
     directions: int = 8  # Random directions of the actions

@@ -24,7 +24,7 @@ from jumper_warp.tasks.saving import TaskError, task_to_json
 from jumper_warp.utils.errors import InputError
 
 PROJECT_TASKS = (
-    "vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted", "omnidirectional-jump",
+    "vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "vertical-jump-standing", "horizontal-jump-standing",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
     "velocity-flat", "velocity-rough", "velocity-trot", "vertical-jump-paper", "horizontal-jump-paper",
     "velocity-paper", "attitude",

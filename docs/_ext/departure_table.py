@@ -26,8 +26,8 @@ PAPERS = {"vertical-jump": "vertical-jump-paper", "horizontal-jump": "horizontal
           "velocity-flat": "velocity-paper"}  # fmt: skip
 """The paper's task by our task."""
 BASES = {
-    "horizontal-jump-slippery": "horizontal-jump", "horizontal-jump-sighted": "horizontal-jump",
-    "omnidirectional-jump": "horizontal-jump", "vertical-jump-mars": "vertical-jump",
+    "horizontal-jump-sighted": "horizontal-jump", "vertical-jump-standing": "vertical-jump",
+    "horizontal-jump-standing": "horizontal-jump", "vertical-jump-mars": "vertical-jump",
     "vertical-jump-mars-loose": "vertical-jump-mars", "horizontal-jump-mars": "horizontal-jump",
     "horizontal-jump-mars-loose": "horizontal-jump-mars", "velocity-rough": "velocity-flat",
     "velocity-trot": "velocity-flat", "attitude": "",

@@ -57,19 +57,6 @@ def places_of_sequel(task: TaskCfg) -> TaskCfg:
     return with_goals(task, [((near, *low), (far, *top)) for near, far in ahead], starts=2)
 
 
-def alike_all_around(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with circular instead of elliptical goal ranges.
-
-    The radius is the reach ahead.
-    """
-    levels = list(task.levels)
-    for i, level in enumerate(levels):
-        reach = level.goal_upper[0]
-        if level.elliptical:
-            levels[i] = replace(level, goal_lower=(-reach, -reach, 0.0), goal_upper=(reach, reach, 0.0))
-    return replace(task, levels=tuple(levels))
-
-
 def without_another_goal(task: TaskCfg) -> TaskCfg:
     """Return a copy of the task in which a landed robot never gets a goal for a next jump."""
     return replace(task, levels=tuple(replace(level, next_jump_probability=0.0) for level in task.levels))
@@ -78,7 +65,6 @@ def without_another_goal(task: TaskCfg) -> TaskCfg:
 CHANGES: dict[str, dict[str, Callable[[TaskCfg], TaskCfg]]] = {
     "vertical-jump": {"jumping-early": may_jump_early, "goals": heights_of_paper},
     "horizontal-jump": {"goals": places_of_paper, "another-goal": without_another_goal},
-    "omnidirectional-jump": {"reaches": alike_all_around},
     "horizontal-jump-mars-loose": {"goals": places_of_sequel},
 }
 """Changes by task and name of the departure; the changed task is `TASK-NAME`."""

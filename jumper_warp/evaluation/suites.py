@@ -101,7 +101,7 @@ class Grid(Suite):
 class Ring(Suite):
     """Jumps to goals spread evenly over a ring around the start."""
 
-    policy: str = "omnidirectional_jump"
+    policy: str = "horizontal_jump"
     radius: float = 0.5  # [m] Radius of the ring
 
     name: ClassVar = "ring"

@@ -38,6 +38,11 @@ PICTURES = (".png", ".webp", ".jpg", ".gif")  # Suffixes of files that a policy 
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
 PURPOSE = "file of a policy"
+REPLACED = {
+    "slippery_jump": "horizontal_jump", "slippery_waiting_jump": "horizontal_jump",
+    "omnidirectional_jump": "horizontal_jump", "mars_vertical_jump_stock": "mars_vertical_jump",
+}  # fmt: skip
+"""Policy in place of each earlier one."""
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
 SUCCESSES = ("success_rate", "settled_without_collision_rate")
@@ -109,6 +114,8 @@ def _no_policy(text: str, path: Path) -> str:
         return f"{path} is a file; give the folder of a policy or of a training run"
     if len(path.parts) > 1 or path.suffix:
         return f"{path}: no such folder (policy)"
+    if instead := REPLACED.get(text.replace("-", "_")):
+        return f"{text} is no longer included: use {instead}"
     tasks = policy_tasks()
     task = task_name(text)
     if task is not None:

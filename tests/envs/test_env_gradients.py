@@ -20,7 +20,7 @@ from jumper_warp.utils.errors import InputError
 
 POLICIES = {
     "vertical-jump": "vertical_jump",
-    "horizontal-jump": "slippery_jump",
+    "horizontal-jump": "horizontal_jump",
     "velocity-flat": "walking_flat",
     "attitude": "attitude",
 }

@@ -341,7 +341,7 @@ def test_landing_evaluation_excludes_shaping_terminations():
 
 @pytest.mark.parametrize(
     ("task", "range_m"),
-    [("horizontal-jump", [0.2, 2.2]), ("omnidirectional-jump", [0.0, 1.4]), ("vertical-jump", [0.45, 1.15])],
+    [("horizontal-jump", [0.2, 2.2]), ("horizontal-jump-standing", [0.0, 2.2]), ("vertical-jump", [0.45, 1.15])],
 )
 def test_trained_range_covers_all_levels(task, range_m):
     assert trained_range(make_task(task)) == {"trained_range_m": range_m}

@@ -48,7 +48,7 @@ def test_condition_is_undefined_only_where_its_change_does_nothing():
     }
 
 
-@pytest.mark.parametrize(("policy", "count"), [("vertical_jump", 300), ("omnidirectional_jump", 300),
+@pytest.mark.parametrize(("policy", "count"), [("vertical_jump", 300), ("horizontal_jump", 300),
                                                ("attitude", 300), ("walking_flat", 2 * 5**3 + 64)])  # fmt: skip
 def test_evaluations_have_at_least_the_requested_trials(policy, count):
     run = EvaluationRun(policy)
@@ -102,8 +102,8 @@ def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):
 def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr(measure_policies.subprocess, "run", lambda command, **_: calls.append(command))
-    run_test("slippery_jump", "side_friction_0.4", tmp_path, ["--seed", "1"])
-    assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "slippery_jump"]
+    run_test("horizontal_jump", "side_friction_0.4", tmp_path, ["--seed", "1"])
+    assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "horizontal_jump"]
     assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
     assert all((POLICIES.parents[1] / test["command"].split()[0]).is_file() or test["command"].startswith("jumper ")
                for test in TESTS.values() if "command" in test)  # fmt: skip

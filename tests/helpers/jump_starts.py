@@ -13,7 +13,7 @@ from jump_helpers import START_MODES, begin_by, edit_episodes, episodes_of, only
 from jumper_warp.envs.env import Env
 from solver_helpers import Reference, States, paw_joint
 
-PLACES = ("horizontal-jump", "omnidirectional-jump")  # Names of the tasks of jumps to landing positions
+PLACES = ("horizontal-jump", "horizontal-jump-standing")  # Names of the tasks of jumps to landing positions
 PAW_RADIUS = 0.025  # [m]
 ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of a paw's centre in the frame of the joint that carries it
 

@@ -18,15 +18,15 @@ def test_cross_levels_repeats_all_starts_for_each_level_of_goals():
     assert [level.base_height for level in levels] == [*STARTS, *STARTS]
 
 
-@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump", "vertical-jump-mars"])
+@pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "horizontal-jump-standing", "vertical-jump-mars"])
 def test_each_goal_level_has_the_easier_and_then_the_harder_starts(name):
     levels = make_task(name).levels
     for easier, harder in zip(levels[0::2], levels[1::2], strict=True):
         assert dataclasses.replace(easier, base_height=STARTS[1]) == harder and easier.base_height == STARTS[0]
 
 
-def test_omnidirectional_goals_are_elliptical_and_grow_with_the_level():
-    task = make_task("omnidirectional-jump")
+def test_goals_in_all_directions_are_elliptical_and_grow_with_the_level():
+    task = make_task("horizontal-jump-standing")
     reaches = [(level.goal_upper[0], level.goal_upper[1], -level.goal_lower[0]) for level in task.levels[2::2]]
     assert all(level.elliptical for level in task.levels[2:])
     assert reaches == sorted(reaches) and all(

@@ -66,7 +66,7 @@ def sampled_ground_env(name, count, ground, seed=2, reset=None, **changes):
 @pytest.fixture(scope="module", params=PLACES)
 def env(request):
     """Return each task's environment, which draws a platform, a block or level ground at a reset."""
-    levels = {"levels": WIDE} if request.param == "omnidirectional-jump" else {}
+    levels = {"levels": WIDE} if request.param == "horizontal-jump-standing" else {}
     return sampled_ground_env(request.param, N, GroundCfg(platform=0.5, block=0.5), **levels)
 
 
