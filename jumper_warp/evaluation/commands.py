@@ -46,7 +46,7 @@ class EvaluateCfg(Generic[Flags]):
     """Measure a policy over many trials, print its metrics and write metrics.json."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
+    """Flags of the task's kind, see `jumper_warp.tasks.evaluation.Evaluation.flags`."""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """Conditions of the evaluation."""
     out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
@@ -156,7 +156,7 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """Simulate a policy, and write a recording, a picture, metrics and a film."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
+    """Flags of the task's kind, see `jumper_warp.tasks.evaluation.Evaluation.flags`."""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
     rewards: bool = False  # Record the task's reward terms too; their kernel is compiled at the first use

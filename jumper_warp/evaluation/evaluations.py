@@ -4,44 +4,16 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import fields
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
-from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.registry import TASKS
-from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
-from jumper_warp.utils.metrics import Metrics
-
-
-class EvaluationFlags(Protocol):
-    """Interface of a dataclass with the flags of `jumper evaluate` for some tasks, such as jumps to heights."""
-
-    def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return a new evaluation log, which sets all worlds' commands and records outcomes; seed: of the commands."""
-        ...
-
-    def metrics(self, log: Any) -> Metrics:
-        """Return the metrics of a finished evaluation log that `self.log` returned."""
-        ...
-
-
-class PlayFlags(Protocol):
-    """Interface of dataclasses with the flags of `jumper play` for a kind of task, such as jumps or walks."""
-
-    @property
-    def length(self) -> float:
-        """Default length of the recording [s]."""
-        ...
-
-    def log(self, task: TaskCfg) -> EvaluationLog:
-        """Return a new evaluation log, which sets the commands of all worlds and records their outcomes."""
-        ...
 
 
 def default_flags(evaluation: Evaluation, command: Literal["evaluate", "play"]) -> Any:
     """Return the default flags of a command for a task, with the values of the evaluation's fields of the same names.
 
-    They are `EvaluationFlags` for `jumper evaluate`, and `PlayFlags` for `jumper play`.
+    `Evaluation.flags` has their methods.
     """
     module, _, name = evaluation.flags.partition(":")
     kind = getattr(importlib.import_module(module), f"{name}{'Play' * (command == 'play')}Flags")

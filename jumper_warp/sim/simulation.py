@@ -409,25 +409,6 @@ class Simulation(Uncopied):
         self._launch(base_velocity_kernel, self.num_worlds, inputs, [self._base_velocity])
         return self._base_velocity
 
-    @locked
-    def loop_gap(self) -> np.ndarray:
-        """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,).
-
-        On SolverJumper it is a rounding error, since loops are closed by construction; SolverMuJoCo's are soft.
-        """
-        model = self.model
-        parents, children = model.joint_parent.numpy(), model.joint_child.numpy()
-        frames = self.state.body_q.numpy()
-        gaps = []
-        for joint in (i for i, label in enumerate(model.joint_label) if label.endswith("_ankle")):
-            ends = []
-            for body, anchor in ((parents[joint], model.joint_X_p), (children[joint], model.joint_X_c)):
-                point, quat = anchor.numpy()[joint, :3], frames[body, 3:6]
-                rotated = point + 2.0 * np.cross(quat, np.cross(quat, point) + frames[body, 6] * point)
-                ends.append(frames[body, :3] + rotated)
-            gaps.append(np.linalg.norm(ends[0] - ends[1]))
-        return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
-
 
 def _values_of(
     robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues | None, friction: float, num_worlds: int

@@ -19,7 +19,9 @@ class Evaluation:
 
     flags: ClassVar[str]
     """Dataclasses of the flags, as `module:Name`: `NameFlags` has those of `jumper evaluate`, `NamePlayFlags` those of
-    `jumper play`; see `EvaluationFlags` and `PlayFlags` in `jumper_warp.evaluation.evaluations`."""
+    `jumper play`. The method `log(task, seed)` of the first and `log(task)` of the second return a new `EvaluationLog`,
+    which sets the commands of all worlds and records outcomes; `metrics(log)` of the first returns its metrics, and
+    `length` of the second is the default length of the recording [s]."""
     published: ClassVar[Mapping[str, float]] = {}
     """Values in the paper of the metrics with the same keys, for the default settings."""
 

@@ -32,6 +32,19 @@ def write_state(sim, q=None, qd=None):
     sim.solver.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
 
+def loop_gap(sim):
+    """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,)."""
+    model, frames = sim.model, sim.state.body_q.numpy()
+    gaps = []
+    for joint in (i for i, label in enumerate(model.joint_label) if label.endswith("_ankle")):
+        ends = []
+        for body_of, anchor in ((model.joint_parent, model.joint_X_p), (model.joint_child, model.joint_X_c)):
+            frame = frames[body_of.numpy()[joint]]
+            ends.append(frame[:3] + Rotation.from_quat(frame[3:]).apply(anchor.numpy()[joint, :3]))
+        gaps.append(np.linalg.norm(ends[0] - ends[1]))
+    return np.array(gaps).reshape(sim.num_worlds, 4).max(axis=1)
+
+
 def command(sim, angles):
     """Command motor angles [rad], (num_worlds, 12)."""
     sim.target.assign(np.ascontiguousarray(np.broadcast_to(angles, (sim.num_worlds, 12)).T, dtype=np.float32))
