@@ -201,3 +201,10 @@ def test_paws_landed_has_a_bit_for_each_paw_in_contact_since_touchdown():
     states, _, _ = advance(views, flying)
     assert states["phase"].tolist() == [int(FLIGHT)] + 4 * [int(LANDED)]
     assert states["paws_landed"][1:].tolist() == [0b0001, 0b0011, 0b0011, 0b1111]
+
+
+def test_the_squat_is_the_lowest_height_from_the_command_to_the_takeoff():
+    heights = (0.20, 0.35, 0.30, 0.25, 0.28, 0.40, 0.22)
+    views = views_of(contacts=(4, 4, 4, 4, 4, 0, 4), up=(0.0,) * 5 + (2.0, 0.0), z=heights)
+    tasks, _, _ = advance(views, make_episode(command_step=2))
+    assert tasks["squat"].tolist() == pytest.approx([0.20, 0.35, 0.30, 0.25, 0.25, 0.25, 0.25])

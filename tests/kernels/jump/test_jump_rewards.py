@@ -8,7 +8,8 @@ from jumper_warp.kernels.jump import rewards
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = """jump_height estimated_jump_height horizontal_velocity orientation angular_velocity joint_symmetry
-ground_posture air_posture post_landing_posture paws_down soft_impact stance_impact catch_landing damp_landing"""
+ground_posture air_posture post_landing_posture paws_down soft_impact stance_impact catch_landing damp_landing
+squat touchdown_tracking folded_legs"""
 reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
@@ -170,3 +171,34 @@ def test_paws_down_is_the_number_of_contacts_after_touchdown():
     assert reward("paws_down", view, make_episode(phase=LANDED)) == 3.0
     for phase in (STANCE, FLIGHT):
         assert reward("paws_down", view, make_episode(phase=phase)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("height", "wanted"),
+    # 50 m/s^2 from the squat up to 0.3 m give the speed of the apex: v^2 = 2 * 9.81 (apex - 0.3) = 2 * 50 (0.3 - squat)
+    [(0.8, 0.3 - 9.81 * 0.5 / 50.0), (0.25, 0.3), (3.0, 0.15)],
+)
+def test_squat_is_paid_at_the_apex_for_the_depth_that_the_height_needs(height, wanted):
+    numbers = {"std": 0.02, "takeoff_height": 0.3, "acceleration": 50.0, "floor": 0.15}
+    for offset, expected in ((0.0, 1.0), (0.02, E(-1.0)), (-0.02, E(-1.0))):
+        fields = {"phase": FLIGHT, "squat": wanted + offset, "goal": (0.0, 0.0, height)}
+        at_apex = make_episode(at_apex=1, **fields)
+        assert reward("squat", make_view(), at_apex, **numbers) == pytest.approx(expected, rel=1e-4)
+        assert reward("squat", make_view(), make_episode(at_apex=0, **fields), **numbers) == 0.0
+
+
+def test_touchdown_tracking_is_paid_once_for_the_distance_from_the_goal():
+    view, goal = make_view(pos=(1.06, -2.08, 0.3)), {"goal": (1.0, -2.0, 0.0)}  # 0.1 m away
+    touching = make_episode(phase=LANDED, touched_down=1, **goal)
+    assert reward("touchdown_tracking", view, touching, std=0.1) == pytest.approx(E(-1.0), rel=1e-4)
+    assert reward("touchdown_tracking", view, make_episode(phase=LANDED, **goal), std=0.1) == 0.0
+
+
+def test_folded_legs_counts_transversal_angles_beyond_the_limit_in_flight():
+    angle = np.zeros(12)
+    angle[[0, 1, 5, 8]] = [3.0, 2.2, 2.4, 1.9]  # lateral, outer, inner, inner
+    view = make_view(angle=angle)
+    expected = 0.2**2 + 0.4**2  # [rad^2] beyond 2 rad
+    assert reward("folded_legs", view, make_episode(phase=FLIGHT), angle=2.0) == pytest.approx(expected, rel=1e-4)
+    for phase in (STANCE, LANDED):
+        assert reward("folded_legs", view, make_episode(phase=phase), angle=2.0) == 0.0

@@ -5,7 +5,8 @@ from jumper_warp.kernels.jump import terminations
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = (
-    "landed_for wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
+    "landed_for wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff "
+    "shallow_squat crouched"
 )
 holds = Table(functions(terminations, NAMES), bool)
 """holds(name, view, episode, **numbers): whether a termination holds."""
@@ -83,3 +84,25 @@ def test_early_takeoff_is_a_takeoff_before_the_command_step():
     assert holds("early_takeoff", make_view(), make_episode(took_off=1, steps=29, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=1, steps=30, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=0, steps=29, **jumped))
+
+
+def test_shallow_squat_is_a_takeoff_from_above_the_wanted_squat():
+    numbers = {"tolerance": 0.04, "takeoff_height": 0.3, "acceleration": 50.0, "floor": 0.15}
+    for squat, shallow in ((0.240, False), (0.243, True)):  # wanted: 0.3 - 9.81 * 0.5 / 50 = 0.2019 m
+        fields = {"phase": FLIGHT, "squat": squat, "goal": (0.0, 0.0, 0.8)}
+        assert holds("shallow_squat", make_view(), make_episode(took_off=1, **fields), **numbers) is shallow
+        assert not holds("shallow_squat", make_view(), make_episode(took_off=0, **fields), **numbers)
+
+
+def test_crouched_holds_before_the_command_and_after_the_landing_once_the_time_to_stand_up_is_over():
+    numbers = {"height": 0.28, "start_steps": 18.0, "landing_steps": 90.0}
+    low, high = make_view(pos=(0.0, 0.0, 0.27)), make_view(pos=(0.0, 0.0, 0.29))
+    waiting = make_episode(steps=19, command_step=60)
+    assert holds("crouched", low, waiting, **numbers) and not holds("crouched", high, waiting, **numbers)
+    assert not holds("crouched", low, make_episode(steps=18, command_step=60), **numbers)
+    assert not holds("crouched", low, make_episode(steps=60, command_step=60), **numbers)  # it squats for the jump
+    for steps, ended in ((90, False), (91, True)):
+        landed = make_episode(phase=LANDED, steps=200, phase_steps=steps)
+        assert holds("crouched", low, landed, **numbers) is ended
+        assert not holds("crouched", high, landed, **numbers)
+    assert not holds("crouched", low, make_episode(phase=FLIGHT, phase_steps=200), **numbers)
