@@ -16,7 +16,7 @@ from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.trajectory.gauss_newton import Network
 
-FEW = {"num_goals": 4, "num_delayed": 0, "num_randomized": 0, "height_range": (0.8, 1.05)}
+FEW = {"num_goals": 4, "num_delayed": 0, "num_randomized": 0, "height_range": (1.2, 2.5)}
 FEW |= {"iterations": 1, "device": "cpu"}
 
 
@@ -27,24 +27,24 @@ def tuned():
 
 
 def aiming_high():
-    """Return the shipped policy with an observation of the commanded height that is 8 mm too large."""
-    policy = Policy.load("vertical_jump")
+    """Return the shipped policy with an observation of the commanded height that is 20 mm too large."""
+    policy = Policy.load("mars_vertical_jump")
     tensors = policy.tensors()
     mean = tensors["normaliser.mean"].clone()
-    mean[policy.interface.observation_names.index("wanted_height")] -= 0.008
+    mean[policy.interface.observation_names.index("wanted_height")] -= 0.02
     return Policy(policy.layers, mean, tensors["normaliser.std"], policy.interface, policy.config)
 
 
 def test_jump_errors_match_environment_with_and_without_derivatives():
-    policy = Policy.load("vertical_jump")
+    policy = Policy.load("mars_vertical_jump")
     (group,) = make_groups(policy.recipe(), FinetuneCfg(**FEW))
     network = Network(policy)
     errors, plain = jump_errors(group, network, derivatives=True), jump_errors(group, network, derivatives=False)
     assert torch.equal(errors.value, plain.value)
     assert errors.jacobian.shape == (4, len(network.weights)) and errors.valid.all()
-    jumps = JumpLog(np.linspace(0.8, 1.05, 4), group.env.task.termination_names)
+    jumps = JumpLog(np.linspace(1.2, 2.5, 4), group.env.task.termination_names)
     group.begin()
-    for _ in range(120):  # 2 s, until after the apex
+    for _ in range(180):  # 3 s, until after the apex
         group.env.step(policy.act(group.env.obs))
         jumps.update(jumps.read_env(group.env), group.env.step_dt)
     misses = jumps.outcome.apex_error_m[:, 0]
@@ -52,8 +52,8 @@ def test_jump_errors_match_environment_with_and_without_derivatives():
 
 
 def test_errors_of_bases_that_rise_twice_are_those_of_the_evaluation():
-    """The last robot's base rises again after every other robot has passed its apex, by 13.7 mm."""
-    policy, count = Policy.load("vertical_jump"), 64
+    """Two of three bases rise again after their first apex, by up to 12 mm."""
+    policy, count = Policy.load("mars_vertical_jump"), 64
     _, group = make_groups(policy.recipe(), FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=count, device="cpu"))
     errors = jump_errors(group, Network(policy), derivatives=False)
     jumps = JumpLog(group.commands[:, 2], group.env.task.termination_names)
@@ -78,7 +78,7 @@ def test_finetuning_to_another_robot_keeps_its_overlay(tmp_path):
     overlay = RobotOverlay({"base_mass": (7.43,), "kp": 12 * (0.88,), "kd": 12 * (1.15,)})
     overlay.save(tmp_path / "robot.json")
     policy, record = finetune(
-        Policy.load("vertical_jump"), FinetuneCfg(**FEW | {"height_range": (0.6, 0.9)}, robot=tmp_path / "robot.json"),
+        Policy.load("mars_vertical_jump"), FinetuneCfg(**FEW, robot=tmp_path / "robot.json"),
         log=lambda line: None,
     )  # fmt: skip
     assert policy.config["env"]["robot"] == overlay.to_json()
@@ -97,14 +97,14 @@ def test_finetuning_is_bitwise_reproducible(tuned):
 def test_finetune_command_writes_a_loadable_policy_and_refuses_to_overwrite_it(tmp_path, capsys):
     out = tmp_path / "tuned"
     flags = "--num-goals 2 --num-delayed 0 --num-randomized 0 --iterations 1 --device cpu".split()
-    main(["finetune", "vertical_jump", *flags, "--out", str(out)])
+    main(["finetune", "mars_vertical_jump", *flags, "--out", str(out)])
     assert capsys.readouterr().out.splitlines()[-1] == str(out)
     policy = Policy.load(out)
-    assert not torch.equal(policy.layers[0][0], Policy.load("vertical_jump").layers[0][0])
+    assert not torch.equal(policy.layers[0][0], Policy.load("mars_vertical_jump").layers[0][0])
     assert policy.config["finetuned"]["settings"]["num_goals"] == 2
     assert len(json.loads((out / "finetuning.json").read_text())["steps"]) == 2
     with pytest.raises(SystemExit) as end:
-        main(["finetune", "vertical_jump", "--out", str(out)])
+        main(["finetune", "mars_vertical_jump", "--out", str(out)])
     assert end.value.code == 2
     assert capsys.readouterr().err == f"jumper: {out} exists; overwrite replaces it\n"
 
@@ -134,7 +134,7 @@ def test_ballistic_landing_is_where_a_projectile_on_mars_falls_to_0_3_m():
 
 @pytest.mark.parametrize("seed", [0, 5])
 def test_finetuning_and_evaluation_share_no_robot_and_no_delay(seed):
-    policy = Policy.load("vertical_jump")
+    policy = Policy.load("mars_vertical_jump")
     cfg = FinetuneCfg(**FEW | {"num_goals": 2, "num_randomized": 16, "seed": 0})
     tuned = make_groups(policy.recipe(), cfg)[-1].env
     reported = env_of_recipe(policy.recipe(), 16, Conditions(randomize=True, noise=True, seed=seed, device="cpu"))

@@ -25,7 +25,7 @@ def jumps(env, act, goals):
 
 
 def test_robots_with_a_weak_motor_are_rescued():
-    policy = Policy.load("horizontal_jump")
+    policy = Policy.load("sighted_jump")
     goals = [(1.7, 0.0), (1.8, 0.0), (1.9, 0.0)]
     env = robots(policy, WEAK, len(goals))
     lost = ~jumps(env, policy.act, goals)

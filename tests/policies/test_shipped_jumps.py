@@ -17,8 +17,9 @@ QUIET = {"num_recorded": 0, "device": "cpu"}  # no recordings
 
 def test_horizontal_policy_reaches_goals_in_all_directions(tmp_path):
     values = Ring(num_jumps=16, radius=0.6, out=tmp_path, **QUIET).run()  # [m]
-    assert values["success_rate"] == 1.0
-    assert values["goal_distance_at_end_mean_m"] < 0.02
+    assert values["goal_reached_rate"] == 1.0 and values["landed_rate"] == 1.0
+    assert values["goal_distance_at_end_mean_m"] < 0.02  # 0.014 m of 64 jumps
+    assert values["at_rest_rate"] > 0.8  # some still sway one second after touchdown
 
 
 @pytest.mark.parametrize(("policy", "command", "rise"), [

@@ -12,7 +12,7 @@ STEPS = 45  # Policy steps from the command to after the touchdown
 @pytest.fixture(scope="module")
 def jump():
     """Return robots that wait for their command, as a snapshot and a start, and the policy's actions of the jump."""
-    policy = Policy.load("horizontal_jump")
+    policy = Policy.load("sighted_jump")
     env = env_of_recipe(policy.recipe(), 2, Conditions(device="cpu"))
     env.evaluation_reset([[0.5, 0.0, 0.0, 2.0], [0.9, 0.0, 0.0, 2.0]])
     for _ in range(2):
