@@ -56,7 +56,7 @@ def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, mess
 def test_symmetric_training_starts_from_the_projection_of_a_nearly_symmetric_policy():
     policy, task, cfg = Policy.load("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
     symmetry, generator = task_symmetry(task), torch.Generator().manual_seed(2)
-    layers = [(w + 1.0e-3 * torch.randn(w.shape, generator=generator), bias) for w, bias in policy.layers]
+    layers = [(w + 3.0e-4 * torch.randn(w.shape, generator=generator), bias) for w, bias in policy.layers]
     near = Policy(layers, policy.mean, policy.std, policy.interface, policy.config)
     start = make_actor_init(layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
