@@ -105,12 +105,16 @@ class BusSim:
             self._late.append((motor, data))
         else:
             self.take(motor, data)
+        return [data_frame(own_id if self.faults.motor_own_id else HOST_ID, self.replies()[motor].tobytes())]
+
+    def replies(self) -> np.ndarray:
+        """Return the motors' replies in the present state, (12, 8) uint8."""
         if self._replies is None:
             position, velocity, torque = self.bias + [self.angle - self.zero, self.rate, self.torque]
             error = np.array([self.faults.error_code] + 11 * [0])
             reply = Reply(position, velocity, torque, np.full(12, self.faults.temperature), error)
             self._replies = self.codec.encode_reply(np.tile([1, 2, 3], LEGS), reply)
-        return [data_frame(own_id if self.faults.motor_own_id else HOST_ID, self._replies[motor].tobytes())]
+        return self._replies
 
     def take(self, motor: int, data: bytes) -> None:
         """Store a motor's command, or switch it."""

@@ -94,13 +94,14 @@ class JointMap:
             ["lateral" not in name for name in settings["joint_names"]]
         )  # (12,) whether it is one
         self.codec = Codec(settings["motors"])
+        self._by_joint = Codec([settings["motors"][motor] for motor in self.motor])
 
     def read(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the joints' angles [rad], rates [rad/s], torques [N m], temperatures [°C] and error codes, (12,) each.
 
         frames: replies of the motors, (12, 8) uint8. The first three are float32.
         """
-        position, velocity, torque, temperature, error = (each[self.motor] for each in self.codec.decode_reply(frames))
+        position, velocity, torque, temperature, error = self._by_joint.decode_reply(frames[self.motor])
         angle = (self.sign * position + self.offset).astype(np.float32)
         rate = (self.sign * velocity).astype(np.float32)
         return angle, rate, (self.sign * torque).astype(np.float32), temperature, error
@@ -108,10 +109,10 @@ class JointMap:
     def frames(self, target: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> np.ndarray:
         """Return the motors' command frames (12, 8) uint8; target [rad], kp, kd: (12,), by joint."""
         command = np.zeros((5, 12))
-        command[0, self.motor] = self.sign * (target - self.offset)
-        command[2, self.motor] = kp
-        command[3, self.motor] = kd
-        return self.codec.encode(command)
+        command[0], command[2], command[3] = self.sign * (target - self.offset), kp, kd
+        frames = np.empty((12, 8), np.uint8)
+        frames[self.motor] = self._by_joint.encode(command)
+        return frames
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:

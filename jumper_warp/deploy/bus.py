@@ -30,7 +30,7 @@ RECEIVED = np.dtype([
 """Frames received in a tick: newest data and whether they are new, number of error frames and of unknown frames, and
 buses that cannot send."""
 LOCKSTEP_TIMEOUT = 30.0  # [s] Longest wait for the other side in lockstep
-_FRAME = struct.Struct("<IBB8s")  # id, length, whether it is an error frame, data
+_FRAME = struct.Struct("<dIBB8s")  # time of sending, id, length, whether it is an error frame, data
 
 
 def data_frame(number: int, data: bytes, bus: int | None = None) -> can.Message:
@@ -42,20 +42,29 @@ class UnixBus(can.BusABC):
     """Bus over Unix datagrams between two sockets of this machine."""
 
     def __init__(self, local: Path | None, peer: Path) -> None:
-        """Bind a socket to the path `local` (None: only send), and send to the path `peer`."""
+        """Bind a socket to the path `local` (None: only send), and send to the path `peer`.
+
+        Raises CanInitializationError: another process has bound `local`. A socket of a dead process is replaced.
+        """
         super().__init__(channel=str(peer))
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._peer, self._local = str(peer), local
+        self._peer, self._local = str(peer), None
         if local is not None:
+            with suppress(FileNotFoundError, ConnectionRefusedError):
+                self._socket.connect(str(local))
+                self.shutdown()
+                raise can.CanInitializationError(f"another process uses {local}")
             local.unlink(missing_ok=True)
             self._socket.bind(str(local))
+            self._local = local
         self._socket.setblocking(False)
         self.fileno = self._socket.fileno
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame at once. Raises CanOperationError: the queue is full, or nobody has bound the peer."""
         try:
-            self._socket.sendto(_FRAME.pack(msg.arbitration_id, msg.dlc, msg.is_error_frame, msg.data), self._peer)
+            frame = _FRAME.pack(time.time(), msg.arbitration_id, msg.dlc, msg.is_error_frame, msg.data)
+            self._socket.sendto(frame, self._peer)
         except OSError as error:
             raise can.CanOperationError(f"{self._peer}: {error}") from error
 
@@ -64,10 +73,10 @@ class UnixBus(can.BusABC):
         if timeout != 0.0 and not select.select([self._socket], [], [], timeout)[0]:
             return None
         try:
-            number, length, error, data = _FRAME.unpack(self._socket.recv(_FRAME.size))
+            sent, number, length, error, data = _FRAME.unpack(self._socket.recv(_FRAME.size))
         except BlockingIOError:
             return None
-        return can.Message(arbitration_id=number, data=data[:length], is_error_frame=bool(error), is_extended_id=False)
+        return can.Message(sent, number, is_extended_id=False, is_error_frame=bool(error), data=data[:length])
 
     def shutdown(self) -> None:
         """Close the socket and remove its path."""
@@ -82,7 +91,8 @@ def open_buses(spec: str, side: str = "host") -> list[can.BusABC]:
 
     side: "host" (the runtime), "robot" (the simulated far end) or "watchdog" (only sends). The last two reach this
     machine alone: UDP packets have a hop limit of 0, and the folder is created for its owner only.
-    Raises InputError: the specification is wrong, or this machine lacks the interface.
+    Raises InputError: the specification is wrong, this machine lacks the interface, or another process has this side
+    of the folder.
     """
     kind, _, channel = spec.partition(":")
     try:
@@ -116,33 +126,40 @@ class Link:
         """
         self.buses = list(buses)
         self.received = np.zeros((), RECEIVED)
+        self._data = {name: self.received[name].data.cast("B") for name in ("motor", "sensor")}
         self.listener = listener
         self._reply_id, self._deadline, self._pump = reply_id, deadline, pump
+        self._begin, self._end = 0.0, 0.0  # of the exchange, and of the wait for replies
+        self._sent = b""
 
     def send(self, frames: np.ndarray) -> None:
         """Send the motors' frames (12, 8) uint8, of each bus in turn; a bus that cannot send is marked as off."""
-        self.received["bus_off"] = False
-        queue = [(leg, j + 1, frames[MOTORS * leg + j].tobytes()) for j in range(MOTORS) for leg in range(LEGS)]
+        record = self.received
+        data = self._sent = frames.tobytes()
+        for name in ("motor_fresh", "sensor_fresh", "error_frames", "unknown", "bus_off"):
+            record[name] = 0
+        self._begin = time.time()
+        rows = [(leg, j) for j in range(MOTORS) for leg in range(LEGS)]
+        queue = [(leg, j + 1, data[8 * (MOTORS * leg + j) :][:8]) for leg, j in rows]
         if self._pump is not None:
             queue += [(leg, SYNC, b"") for leg in range(LEGS)]
-        for leg, number, data in queue:
-            message = data_frame(number, data, leg)
+        for leg, number, part in queue:
+            message = data_frame(number, part, leg)
             if self.listener is not None and number != SYNC:
                 message.timestamp = time.time()
                 self.listener(message)
             try:
                 self.buses[leg].send(message)
             except can.CanError:
-                self.received["bus_off"][leg] = True
+                record["bus_off"][leg] = True
+        self._end = time.monotonic() + self._deadline
 
     def collect(self) -> np.ndarray:
-        """Return the frames received since the last call, a record of RECEIVED; waits until all came or the deadline.
+        """Return the frames received in this tick, a record of RECEIVED; waits until all came or the deadline.
 
         Data of frames that did not come are the last ones received. Raises InputError: no far end in lockstep.
         """
         record = self.received
-        for name in ("motor_fresh", "sensor_fresh", "error_frames", "unknown"):
-            record[name] = 0
         if self._pump is not None:
             self._pump()
             for leg, bus in enumerate(self.buses):
@@ -152,10 +169,10 @@ class Link:
                     self._pump = None  # the last ticks, which brake, do not wait
                     raise InputError(f"no frames in lockstep for {LOCKSTEP_TIMEOUT:g} s: run jumper bus-sim --lockstep")
             return record.copy()
-        end = time.monotonic() + self._deadline
+        time.sleep(0.3 * self._deadline)  # no reply comes before: each wake-up takes CPU time
         waiting = {bus.fileno(): leg for leg, bus in enumerate(self.buses)}
         while not (record["motor_fresh"].all() and record["sensor_fresh"][:2].all()):
-            left = end - time.monotonic()
+            left = self._end - time.monotonic()
             ready = select.select(list(waiting), [], [], max(0.0, left))[0]
             for leg in map(waiting.__getitem__, ready):
                 with suppress(can.CanError):
@@ -166,9 +183,11 @@ class Link:
         return record.copy()
 
     def _take(self, leg: int, message: can.Message) -> None:
-        """Store a received frame; frames of other ids are counted as unknown."""
+        """Store a received frame; frames of other ids are counted as unknown, and own ones, of multicast, ignored."""
         record, data, number = self.received, message.data, message.arbitration_id
         motor = data[0] if len(data) == 8 else 0
+        if 1 <= number <= MOTORS and data == self._sent[8 * (MOTORS * leg + number - 1) :][:8]:
+            return
         if self.listener is not None:
             message.channel = leg
             self.listener(message)
@@ -176,12 +195,12 @@ class Link:
             record["error_frames"] = min(255, int(record["error_frames"]) + 1)
         elif leg == 0 and number in SENSOR_IDS and len(data) == 8:
             row = SENSOR_IDS.index(number)
-            record["sensor"][row] = np.frombuffer(data, np.uint8)
+            self._data["sensor"][8 * row : 8 * row + 8] = data
             record["sensor_fresh"][row] = True
         elif 1 <= motor <= MOTORS and number == (motor if self._reply_id is None else self._reply_id):
             row = MOTORS * leg + motor - 1
-            record["motor"][row] = np.frombuffer(data, np.uint8)
-            record["motor_fresh"][row] = True
+            self._data["motor"][8 * row : 8 * row + 8] = data
+            record["motor_fresh"][row] |= not 0.0 < message.timestamp < self._begin  # late replies: of the last tick
         else:
             record["unknown"] = min(255, int(record["unknown"]) + 1)
 

@@ -14,7 +14,6 @@ import numpy as np
 ENTER, EXIT, ZERO = (bytes([0xFF] * 7 + [last]) for last in (0xFC, 0xFD, 0xFE))
 """Frames that switch a motor to MIT mode, switch it off, and make its present position zero."""
 COMMAND_BITS = (16, 12, 12, 12, 12)  # position, velocity, kp, kd, torque
-REPLY_BITS = (16, 12, 12)  # position, velocity, torque, after the motor's id
 HOST_ID = 0  # Arbitration id of replies, whose first byte is the motor's id
 KINDS = {"AK80-9": 18.0, "AK70-10": 25.0}  # Full scale of the torque by type of motor [N m]
 
@@ -27,6 +26,27 @@ class Reply(NamedTuple):
     torque: np.ndarray  # (n,) [N m]
     temperature: np.ndarray  # (n,) [°C]
     error: np.ndarray  # (n,) error code: 0 none, 1 temperature, 2 current, 3 and 4 voltage, 5 encoder, 6 phases
+
+
+class Fields:
+    """Fields of frames of 8 bytes, the most significant first."""
+
+    def __init__(self, bits: Sequence[int]) -> None:
+        """Take the number of bits of each field; their sum is 64."""
+        self._shift = (64 - np.cumsum(bits))[:, None]
+        self._mask = 2 ** np.array(bits)[:, None] - 1
+
+    def pack(self, codes: np.ndarray) -> np.ndarray:
+        """Return frames (n, 8) uint8 with codes (fields, n) int64."""
+        return np.bitwise_or.reduce(codes << self._shift).astype(">i8").view(np.uint8).reshape(-1, 8)
+
+    def unpack(self, frames: np.ndarray) -> np.ndarray:
+        """Return the codes (fields, n) int64 of frames (n, 8) uint8."""
+        return np.ascontiguousarray(frames).view(">i8")[:, 0] >> self._shift & self._mask
+
+
+COMMAND = Fields(COMMAND_BITS)
+REPLY = Fields((8, 16, 12, 12, 8, 8))  # id of the motor, position, velocity, torque, temperature, error code
 
 
 class Codec:
@@ -42,35 +62,26 @@ class Codec:
         self.upper = np.array(upper)
         self.factor = (self.upper - self.lower) / codes
         self.largest = np.broadcast_to(codes, self.lower.shape).copy()
+        self._reply_factor, self._reply_lower = self.factor[[0, 1, 4]], self.lower[[0, 1, 4]]
         self.largest[2] -= 1  # kp below its full scale: no command equals ENTER, EXIT or ZERO
 
     def codes(self, commands: np.ndarray) -> np.ndarray:
         """Return the codes of commands (5, n), saturated. Raises ValueError: one is NaN."""
         if np.isnan(commands).any():
             raise ValueError("a motor command is NaN")
-        codes = np.rint((np.clip(commands, self.lower, self.upper) - self.lower) / self.factor).astype(np.int64)
-        return np.minimum(codes, self.largest)
+        within = np.minimum(np.maximum(commands, self.lower), self.upper)
+        return np.minimum(np.rint((within - self.lower) / self.factor).astype(np.int64), self.largest)
 
     def encode(self, commands: np.ndarray) -> np.ndarray:
         """Return the data of command frames, (n, 8) uint8; commands: rows position, velocity, kp, kd, torque, (5, n).
 
         Values beyond their range saturate. Raises ValueError: one is NaN.
         """
-        position, velocity, kp, kd, torque = self.codes(commands)
-        columns = [
-            position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | kp >> 8, kp & 255, kd >> 4,
-            (kd & 15) << 4 | torque >> 8, torque & 255,
-        ]  # fmt: skip
-        return np.array(columns, np.uint8).T
+        return COMMAND.pack(self.codes(commands))
 
     def decode_command(self, data: np.ndarray) -> np.ndarray:
         """Return the commands (5, n) in command frames (n, 8)."""
-        b = data.T.astype(np.int64)
-        codes = [
-            b[0] << 8 | b[1], b[2] << 4 | b[3] >> 4, (b[3] & 15) << 8 | b[4], b[5] << 4 | b[6] >> 4,
-            (b[6] & 15) << 8 | b[7],
-        ]  # fmt: skip
-        return np.array(codes) * self.factor + self.lower
+        return COMMAND.unpack(data) * self.factor + self.lower
 
     def encode_reply(self, ids: np.ndarray, reply: Reply) -> np.ndarray:
         """Return the data of reply frames, (n, 8) uint8; ids: (n,) ids of the motors on their buses."""
@@ -78,19 +89,13 @@ class Codec:
         rows = [reply.position, reply.velocity, zero, zero, reply.torque]
         position, velocity, _, _, torque = self.codes(np.array(rows))
         temperature = np.clip(np.rint(reply.temperature), 0, 255).astype(np.int64)
-        columns = [
-            ids, position >> 8, position & 255, velocity >> 4, (velocity & 15) << 4 | torque >> 8, torque & 255,
-            temperature, reply.error,
-        ]  # fmt: skip
-        return np.array(columns, np.uint8).T
+        return REPLY.pack(np.array([ids, position, velocity, torque, temperature, reply.error]))
 
     def decode_reply(self, data: np.ndarray) -> Reply:
         """Return the values in reply frames (n, 8)."""
-        b = data.T.astype(np.int64)
-        codes = [b[1] << 8 | b[2], b[3] << 4 | b[4] >> 4, (b[4] & 15) << 8 | b[5]]
-        rows = [0, 1, 4]
-        position, velocity, torque = np.array(codes) * self.factor[rows] + self.lower[rows]
-        return Reply(position, velocity, torque, b[6].astype(float), b[7])
+        codes = REPLY.unpack(data)
+        position, velocity, torque = codes[1:4] * self._reply_factor + self._reply_lower
+        return Reply(position, velocity, torque, codes[4].astype(float), codes[5])
 
 
 def dbc(kinds: Sequence[str]) -> str:

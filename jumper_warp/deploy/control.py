@@ -50,12 +50,12 @@ def motor_torque(
 
     def envelope(direction: np.float32) -> np.ndarray:
         """Return the largest torque [N m] along a direction, 1 or -1."""
-        headroom = np.clip((curve.no_load_speed - direction * rate) / width, NONE, ONE)
+        headroom = np.minimum(np.maximum((curve.no_load_speed - direction * rate) / width, NONE), ONE)
         return np.minimum(gains.limit, curve.peak * headroom)
 
-    bounded = np.clip(command, -envelope(-ONE), envelope(ONE))
+    bounded = np.minimum(np.maximum(command, -envelope(-ONE)), envelope(ONE))
     fade = (curve.fade_end - np.abs(rate)) / (curve.fade_end - curve.fade_start)
-    return bounded * np.clip(fade, NONE, ONE)
+    return bounded * np.minimum(np.maximum(fade, NONE), ONE)
 
 
 def clip_target(target: np.ndarray, angle: np.ndarray, rate: np.ndarray, gains: Gains) -> np.ndarray:
@@ -65,4 +65,5 @@ def clip_target(target: np.ndarray, angle: np.ndarray, rate: np.ndarray, gains: 
     [rad/s]: float32.
     """
     damping = gains.kd * rate
-    return np.clip(target, angle + (damping - gains.limit) / gains.kp, angle + (damping + gains.limit) / gains.kp)
+    lowest, highest = angle + (damping - gains.limit) / gains.kp, angle + (damping + gains.limit) / gains.kp
+    return np.minimum(np.maximum(target, lowest), highest)

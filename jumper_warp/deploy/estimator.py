@@ -19,14 +19,17 @@ ROT, VEL, POS, GYRO, ACCEL = (slice(3 * i, 3 * i + 3) for i in range(5))
 SIZE = 15
 GRAVITY = np.array([0.0, 0.0, -9.81])  # [m/s^2]
 IDENTITY = np.eye(3)
+DIAGONAL = np.eye(4)
 CROSS = np.zeros((3, 9))  # cross product with a vector v: (v @ CROSS) as a matrix (3, 3)
 CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = [1.0, -1.0] * 3
+FALL = (GRAVITY @ CROSS).reshape(3, 3)  # its cross product
 OUTER = np.zeros((9, 4, 4))
 """4 q qᵀ - 1 of the quaternion q (xyzw) of a rotation matrix m: m.reshape(9) @ OUTER.reshape(9, 16)."""
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     OUTER[4 * _i] = np.diag([1.0 if row in (_i, 3) else -1.0 for row in range(4)])
     OUTER[3 * _j + _k, [_j, _k, _i, 3], [_k, _j, 3, _i]] = [1.0, 1.0, -1.0, -1.0]
     OUTER[3 * _k + _j, [_j, _k, _i, 3], [_k, _j, 3, _i]] = 1.0
+MOST_VARIANCE = np.array([0.04, 0.04, np.inf, 1.0, 1.0, 1.0])  # [rad^2], [m^2/s^2] of rotation and velocity
 HISTORY = 240  # Updates for which positions are kept for delayed fixes
 
 
@@ -70,10 +73,10 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 def quaternion_of(matrix: np.ndarray) -> np.ndarray:
     """Return the quaternions (..., 4), xyzw, of rotation matrices (..., 3, 3)."""
-    outer = (matrix.reshape(*matrix.shape[:-2], 9) @ OUTER.reshape(9, 16)).reshape(*matrix.shape[:-2], 4, 4) + np.eye(4)
+    outer = (matrix.reshape(-1, 9) @ OUTER.reshape(9, 16)).reshape(-1, 4, 4) + DIAGONAL
     best = outer.diagonal(axis1=-2, axis2=-1).argmax(-1)  # the longest row is the best conditioned
-    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    return row / np.sqrt((row * row).sum(-1, keepdims=True))
+    row = outer[np.arange(len(outer)), best]
+    return (row / np.sqrt((row * row).sum(-1, keepdims=True))).reshape(*matrix.shape[:-2], 4)
 
 
 def level(accel: np.ndarray) -> np.ndarray:
@@ -111,6 +114,10 @@ class Estimator:
         sigma = np.array([*tilt, place, *[0.01] * 3, place, place, cfg.start_height, *spin, *force])
         self.cov = np.tile(np.diag(sigma**2), (n, 1, 1))
         self.flow = np.tile(np.eye(SIZE), (n, 1, 1))  # transition matrix of the error
+        self.paws = np.zeros((n, 4, SIZE))  # Jacobian of the velocity and height that paws imply
+        self.paws[:, range(4), [3, 4, 5, 8]] = 1.0
+        self._white = np.repeat([cfg.gyro_noise**2, cfg.accel_noise**2], 3)
+        self._walk = np.diag(np.repeat([0.0, 0.0, 0.0, cfg.gyro_walk**2, cfg.accel_walk**2], 3))
         self.time = 0.0
         self._past: deque[tuple[float, np.ndarray]] = deque([(0.0, self.pos)], maxlen=HISTORY)
 
@@ -122,7 +129,7 @@ class Estimator:
         gyro (3,) [rad/s] and accel (3,), the specific force [m/s^2], are means over dt; angles q (12,) [rad], rates qd
         (12,) [rad/s] and torques (12,) [N m] are those at its end.
         """
-        gyro, accel, q, qd, torque = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (gyro, accel, q, qd, torque))
+        gyro, accel, q, qd, torque = (np.array(x, dtype=float, ndmin=2) for x in (gyro, accel, q, qd, torque))
         rate = gyro - self.gyro_bias
         self._propagate(rate, accel - self.accel_bias, dt)
         self._observe_paws(rate, q, qd.reshape(-1, 4, 3, 1), torque.reshape(-1, 4, 3, 1))
@@ -132,7 +139,6 @@ class Estimator:
 
     def _propagate(self, rate: np.ndarray, force: np.ndarray, dt: float) -> None:
         """Integrate unbiased rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2] over dt, with the covariance."""
-        cfg = self.cfg
         half = rotation(0.5 * dt * rate)
         middle = self.rot @ half
         acceleration = (middle @ force[..., None])[..., 0] + GRAVITY
@@ -140,18 +146,16 @@ class Estimator:
         self.pos = self.pos + dt * self.vel + 0.5 * dt * dt * acceleration
         self.vel = self.vel + dt * acceleration
         self.rot = middle @ half
-        self.cov = flow @ self.cov @ flow.swapaxes(-1, -2)
+        self.cov = flow @ self.cov @ flow.swapaxes(-1, -2) + dt * self._walk
         # flow maps a bias error of one into the error of dt seconds of white noise
         inputs = flow[:, :9, 9:]
-        white = np.repeat([cfg.gyro_noise**2, cfg.accel_noise**2], 3) / dt
-        self.cov[:, :9, :9] += (inputs * white) @ inputs.swapaxes(-1, -2)
-        self.cov[:, range(9, SIZE), range(9, SIZE)] += np.repeat([cfg.gyro_walk**2, cfg.accel_walk**2], 3) * dt
+        self.cov[:, :9, :9] += (inputs * (self._white / dt)) @ inputs.swapaxes(-1, -2)
 
     def _flow(self, dt: float) -> np.ndarray:
         """Return the transition matrices (n, 15, 15) of the error over dt [s], to second order for the position."""
         flow, step = self.flow, -dt * self.rot
-        flow[:, VEL, ROT] = dt * skew(GRAVITY)
-        flow[:, POS, ROT] = 0.5 * dt * dt * skew(GRAVITY)
+        flow[:, VEL, ROT] = dt * FALL
+        flow[:, POS, ROT] = 0.5 * dt * dt * FALL
         flow[:, POS, VEL] = dt * IDENTITY
         flow[:, ROT, GYRO] = flow[:, VEL, ACCEL] = step
         flow[:, POS, ACCEL] = 0.5 * dt * step
@@ -188,19 +192,17 @@ class Estimator:
         count = self.contact.sum(-1, keepdims=True)
         center = (self.contact[:, None] @ point)[:, 0] / np.maximum(count, 1)  # of the paws in contact, body frame
         arm = (self.rot @ center[..., None])[..., 0] + self.pos
-        jacobian = np.zeros((len(q), 4, SIZE))
-        jacobian[:, range(4), [3, 4, 5, 8]] = 1.0
-        jacobian[:, 3, 0] = arm[:, 1]
-        jacobian[:, 3, 1] = -arm[:, 0]
+        self.paws[:, 3, 0] = arm[:, 1]
+        self.paws[:, 3, 1] = -arm[:, 0]
         implied = np.concatenate([(weight * residual).sum(1) / total, -arm[:, 2:]], axis=1)
         noise = np.concatenate([1.0 / total, np.where(count > 0, cfg.ground**2, 1.0e9)], axis=1)
-        self._correct(jacobian, implied, noise)
+        self._correct(self.paws, implied, noise)
 
     def _correct(self, jacobian: np.ndarray, residual: np.ndarray, noise: np.ndarray) -> None:
         """Apply a Kalman update; jacobian (..., m, 15), residual (n, m), noise (n, m): variances."""
         cross: np.ndarray = jacobian @ self.cov
         spread = cross @ jacobian.swapaxes(-1, -2)
-        spread[:, range(noise.shape[-1]), range(noise.shape[-1])] += noise
+        spread += noise[..., None] * DIAGONAL[: noise.shape[-1], : noise.shape[-1]]
         gain = np.linalg.solve(spread, cross).swapaxes(-1, -2)
         error = (gain @ residual[..., None])[..., 0]
         cov = self.cov - gain @ cross
@@ -231,6 +233,7 @@ class Estimator:
     def estimate(self) -> Estimate:
         """Return the present estimate."""
         variance = self.cov.diagonal(axis1=-2, axis2=-1)
-        sure = (np.abs(self.vel).max(-1) < 30.0) & (variance[:, VEL].max(-1) < 1.0) & (variance[:, :2].max(-1) < 0.04)
+        slow, certain = np.abs(self.vel) < 30.0, variance[:, :6] < MOST_VARIANCE
+        sure = np.all(slow, axis=-1) & np.all(certain, axis=-1)
         values = (self.pos, self.vel, quaternion_of(self.rot), self.contact, ~sure)
         return Estimate(*(x[0] if self.single else x for x in values))

@@ -19,6 +19,7 @@ THIGH = 0.175  # [m]
 SHANK = 0.300  # [m]
 PAW_RADIUS = 0.025  # [m] sphere centred at the ankle
 OUTWARD = FRONT[:, None] * [1.0, -1.0]  # direction of outer and inner knee at positive angles
+INNER = np.array([0.0, 1.0])
 ACROSS = np.array([-1j, 1j])  # turns a vector along the other shank to one across it
 
 
@@ -38,14 +39,15 @@ def legs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ankle = 0.5 * (knee[..., 0] + knee[..., 1]) - 1j * FRONT * rise * span
     shank = (ankle[..., None] - knee) / SHANK  # unit vectors
     det = (shank[..., 0].conj() * shank[..., 1]).imag
-    det = np.where(np.abs(det) < 1.0e-4, np.copysign(1.0e-4, det), det)
+    det = np.copysign(np.maximum(np.abs(det), 1.0e-4), det)
     # rigid shanks: the ankle's velocity along each shank is that of its knee
     along = (shank.conj() * knee_rate).real / det[..., None]
     ankle_rate: Any = along * shank[..., ::-1] * ACROSS
-    pitch = (shank[..., 1:].conj() * (knee_rate * [0.0, 1.0] - ankle_rate)).imag / SHANK
+    pitch = (shank[..., 1:].conj() * (knee_rate * INNER - ankle_rate)).imag / SHANK
     lateral: Any = np.exp(1j * SIDE * angles[..., 0])
     across = lateral * (PLANE_Y + 1j * ankle.imag)  # y and z
-    position = np.stack([ankle.real, across.real, across.imag], axis=-1)
+    position = np.empty(angles.shape)
+    position[..., 0], position[..., 1], position[..., 2] = ankle.real, across.real, across.imag
     jacobian = np.zeros((*angles.shape, 3))
     jacobian[..., 1, 0] = -SIDE * across.imag
     jacobian[..., 2, 0] = SIDE * across.real

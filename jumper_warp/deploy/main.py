@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.check import check_bundle
@@ -82,7 +84,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         raise InputError(f"the rate must be 480 or 500 Hz and seconds above 0, got {rate} and {options.seconds}")
     pump = (lambda: None) if options.lockstep else None
     with bundle.reading():
-        link = Link([], reply_id=bundle.settings["can"]["reply_id"], deadline=0.5 / rate, pump=pump)
+        link = Link([], reply_id=bundle.settings["can"]["reply_id"], deadline=0.6 / rate, pump=pump)
         source = MotionCapture() if options.capture else None
         runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
     link.buses = open_buses(options.bus)
@@ -92,12 +94,13 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Keyboard(options.height, options.place)
     script = {round(at * rate): (request, values) for at, request, values in DEMO}
-    ticks, last = itertools.count(), (State.PASSIVE, 0)
+    ticks, last, replies = itertools.count(), (State.PASSIVE, 0), 0
 
     def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""
-        nonlocal last
-        runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
+        nonlocal last, replies
+        record = runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
+        replies += np.count_nonzero(record["received"]["motor_fresh"])
         if dog is not None:
             dog.beat()
         if (runtime.state, runtime.reason) != last:
@@ -111,7 +114,8 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
                     tick(0.0)
             else:
                 request_real_time()
-                print(json.dumps(run_loop(tick, rate, options.seconds)))
+                result = run_loop(tick, rate, options.seconds)
+                print(json.dumps(result | {"replies_lost": 1.0 - replies / (12 * result["ticks"])}))
     except KeyboardInterrupt:
         pass
     finally:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.ma import is_masked
 
 from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyInterface, checksum_entry
 from jumper_warp.utils.checks import check_number
@@ -81,7 +82,7 @@ class DeployedPolicy:
     def reset(self) -> None:
         """Clear the policy's last action and its history of observations; call it whenever the robot restarts."""
         self.action = np.zeros(len(self.scale), dtype=np.float32)
-        self._frames: dict[str, np.ndarray] = {}  # (history, columns) of each term by name, oldest frame first
+        self._observation = np.zeros(0, np.float32)  # the last one, empty after a reset
 
     def targets(self, readings: Mapping[str, Any]) -> np.ndarray:
         """Return the motor targets until the next policy step [rad], (12,); call it every `policy_dt`.
@@ -105,7 +106,7 @@ class DeployedPolicy:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
         values = {name: self._reading(name, reading) for name, reading in readings.items()}
         values[LAST_ACTION] = self.action
-        return np.concatenate([self._term(name, term, values[name]) for name, term in self.layout.items()])
+        return self._scaled(values)
 
     def _reading(self, name: str, reading: Any) -> np.ndarray:
         """Return a sensor reading as (width,) float32.
@@ -114,26 +115,34 @@ class DeployedPolicy:
         """
         value = _numbers(name, reading, _width(self.layout[name]))
         bound, unit = PLAUSIBLE.get(name, (LARGEST, ""))
-        largest = value[np.argmax(np.abs(value))]
-        if abs(largest) > bound:
+        if np.count_nonzero(np.abs(value) > bound):
+            largest = value[np.argmax(np.abs(value))]
             limit = f"±{bound:.4g} {unit}".strip()
             raise InputError(f"{name} must be within {limit}, got {largest:.4g}; hold the last target")
         if name == "gravity" and not UNIT_LENGTH[0] <= (length := float(np.linalg.norm(value))) <= UNIT_LENGTH[1]:
             raise InputError(f"gravity must be a unit vector, got length {length:.4g}; hold the last target")
         return value
 
-    def _term(self, name: str, term: Mapping[str, Any], value: np.ndarray) -> np.ndarray:
-        """Append a reading (width,), clipped and scaled, to an observation term's history, and return the history.
+    def _scaled(self, values: dict[str, np.ndarray]) -> np.ndarray:
+        """Append readings by term, clipped and scaled, to the history, and return the observation, (num_obs,).
 
-        Shape (history * width,). The oldest frame is first; the first reading after `reset` fills all frames. term:
-        entry of `layout`.
+        The oldest frame of a term is first; the first reading after `reset` fills all frames.
         """
-        value = value - self.default if name == "angle" else value
-        value = np.float32(term["scale"]) * np.clip(value, -term["clip"], term["clip"])
-        frames = self._frames.get(name)
-        past = np.tile(value, (term["history"] - 1, 1)) if frames is None else frames[1:]
-        self._frames[name] = np.concatenate([past, value[None]])
-        return self._frames[name].ravel()
+        terms = self.layout.values()
+        widths = [_width(term) for term in terms]
+        clip, scale = np.repeat(np.array([(term["clip"], term["scale"]) for term in terms], np.float32), widths, 0).T
+        values = values | {"angle": values["angle"] - self.default}
+        value = np.concatenate([values[name] for name in self.layout])
+        value = scale * np.minimum(np.maximum(value, -clip), clip)
+        ends = np.cumsum(widths)
+        if not len(self._observation):
+            parts = zip(np.split(value, ends[:-1]), terms, strict=True)
+            self._observation = np.concatenate([np.tile(part, term["history"]) for part, term in parts])
+        for term, width, end in zip(terms, widths, ends, strict=True):
+            frames = self._observation[term["first"] : term["end"]]
+            frames[:-width] = frames[width:]
+            frames[-width:] = value[end - width : end]
+        return self._observation.copy()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Run the policy's network and return the action, (12,), in [-1, 1].
@@ -154,11 +163,10 @@ class DeployedPolicy:
         settings = self.interface["command_filter"]
         joints = (("target", target), ("angle", angle), ("rate", rate))
         target, angle, rate = (_numbers(name, values, len(JOINTS)).reshape(4, 3) for name, values in joints)
-        target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND)
-        filtered = np.empty_like(target)
-        for motor, kind in enumerate(("lateral", "transversal", "transversal")):
-            joint = (target[:, motor], angle[:, motor], rate[:, motor])
-            filtered[:, motor] = limit_command(*joint, settings[kind], settings)
+        target = np.minimum(np.maximum(target, -COMMAND_BOUND), COMMAND_BOUND)
+        lateral, transversal = settings["lateral"], settings["transversal"]
+        limits = {name: [lateral[name], transversal[name], transversal[name]] for name in lateral}
+        filtered = limit_command(target, angle, rate, limits, settings)
         total = filtered[:, 1] + filtered[:, 2]
         sums = (total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2])
         filtered[:, 1:] += 0.5 * (limit_command(*sums, settings["sum"], settings) - total)[:, None]
@@ -213,16 +221,18 @@ def _interface(file: str | Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _numbers(name: str, values: Any, width: int) -> np.ndarray:
     """Return a number or an array as (width,) float32. Raises InputError: it is of another size, or not finite."""
-    try:
-        with np.errstate(over="ignore"):
-            if np.ma.is_masked(values):
-                raise TypeError("some values are masked")
-            array = np.atleast_1d(np.asarray(values))
-            if array.dtype.kind not in "fiu":
-                raise TypeError(f"values of type {array.dtype}")
-            array = array.astype(np.float32)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must be numbers, got {values!r:.60}") from None
+    array = values
+    if type(values) is not np.ndarray or values.dtype != np.float32 or values.ndim != 1:  # else as in each policy step
+        try:
+            with np.errstate(over="ignore"):
+                if is_masked(values):
+                    raise TypeError("some values are masked")
+                array = np.atleast_1d(np.asarray(values))
+                if array.dtype.kind not in "fiu":
+                    raise TypeError(f"values of type {array.dtype}")
+                array = array.astype(np.float32)
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"{name} must be numbers, got {values!r:.60}") from None
     if array.shape != (width,):
         raise InputError(f"{name} must have {width} values, got shape {array.shape}")
     if not np.isfinite(array).all():
@@ -236,7 +246,7 @@ def _width(term: Mapping[str, Any]) -> int:
 
 
 def limit_command(
-    command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, float], settings: Mapping[str, Any]
+    command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> np.ndarray:
     """Return commands [rad] from which a fraction `weight` of the part beyond the joint limits is removed.
 
@@ -244,22 +254,23 @@ def limit_command(
     weight: 1 - (time until the joint reaches a limit) / horizon, in [0, 1]. Within the zone of a limit it is 1 for
     commands toward the limit, else 0; beyond a limit it is 1.
     command, pos [rad], vel [rad/s]: arrays of one shape. limits: lower, upper, and the widths lower_zone, upper_zone
-    [deg]. settings: horizon [s] and speed_floor, the least speed for the time to a limit [deg/s].
+    [deg], numbers or one for each column. settings: horizon [s] and speed_floor, the least speed for the time to a
+    limit [deg/s].
     """
     lower, upper, lower_zone, upper_zone = (
-        np.float32(math.radians(limits[name])) for name in ("lower", "upper", "lower_zone", "upper_zone")
+        np.radians(limits[name]).astype(np.float32) for name in ("lower", "upper", "lower_zone", "upper_zone")
     )
     floor = np.float32(math.radians(settings["speed_floor"]))
     to_upper = upper - pos
     to_lower = pos - lower
     time_to_limit = np.minimum(to_upper / np.maximum(vel, floor), to_lower / np.maximum(-vel, floor))
-    weight = np.clip(1.0 - time_to_limit / np.float32(settings["horizon"]), 0.0, 1.0)
+    weight = np.minimum(np.maximum(1.0 - time_to_limit / np.float32(settings["horizon"]), 0.0), 1.0)
     near_upper = to_upper < upper_zone
     near_lower = to_lower < lower_zone
     weight = np.where(near_upper | near_lower, 0.0, weight)
     toward_limit = (near_upper & (command > pos)) | (near_lower & (command < pos))
     weight = np.where(toward_limit | (to_upper < 0.0) | (to_lower < 0.0), 1.0, weight)
-    return command + weight.astype(np.float32) * (np.clip(command, lower, upper) - command)
+    return command + weight.astype(np.float32) * (np.minimum(np.maximum(command, lower), upper) - command)
 
 
 class JumpCommand:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 SPIN = 1.0e-4  # [s] before each tick without sleeping; a loop without sleep would be throttled by the kernel
 PRIORITY = 80  # of SCHED_FIFO
+LOCK_ALL = 3  # present and future pages, of mlockall
 
 
 def request_real_time() -> None:
-    """Give the process the real-time priority PRIORITY, or print a warning."""
+    """Give the process the real-time priority PRIORITY and keep its memory in place, or print a warning."""
+    ctypes.CDLL(None).mlockall(LOCK_ALL)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (PermissionError, AttributeError) as error:
@@ -24,39 +28,48 @@ def request_real_time() -> None:
 
 
 def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict[str, Any]:
-    """Call `tick` with its lateness [s] at a rate [Hz] until the time is over.
+    """Call `tick` with its lateness [s] at a rate [Hz] until the time is over, or the operator interrupts.
 
-    A tick that begins more than a period late drops the periods in between. Returns the statistics of `statistics`.
+    A tick that begins more than half a period late drops the next ones, so that they do not begin late too.
+
+    Returns the statistics of `statistics`.
     """
     period = 1.0 / rate
-    begin = due = time.monotonic() + period
-    times: list[tuple[float, float]] = []  # lateness and work of each tick
+    times: list[tuple[float, float, float]] = []  # lateness, CPU time and duration of each tick
     missed = 0
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
+    with uncollected(), suppress(KeyboardInterrupt):
+        begin = due = time.monotonic() + period
         while due - begin < seconds:
             time.sleep(max(0.0, due - time.monotonic() - SPIN))
             while (now := time.monotonic()) < due:
                 pass
+            used = time.thread_time()
             tick(now - due)
-            times.append((now - due, time.monotonic() - now))
-            due += period
-            while due + period < time.monotonic():
-                due += period
-                missed += 1
-    finally:
-        gc.enable()
-        gc.unfreeze()
+            times.append((now - due, time.thread_time() - used, time.monotonic() - now))
+            dropped = round((now - due) / period)
+            due += (1 + dropped) * period
+            missed += dropped
     return statistics(np.array(times).T, missed, period)
 
 
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Pause the garbage collection in a block."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
 def statistics(times: np.ndarray, missed: int, period: float) -> dict[str, Any]:
-    """Return quantiles of lateness and work, (2, n) [s], the share of missed ticks, and the load of a tick."""
+    """Return quantiles of lateness, work (CPU time) and duration, (3, n) [s], and the share of missed ticks."""
     count = times.shape[1]
     result: dict[str, Any] = {"ticks": count, "missed": missed / max(1, count + missed)}
     for quantile in (0.5, 0.99, 0.999, 1.0):
-        for name, value in zip(("late", "work"), np.quantile(times, quantile, axis=1), strict=True):
+        for name, value in zip(("late", "work", "duration"), np.quantile(times, quantile, axis=1), strict=True):
             result[f"{name}_p{100 * quantile:g}_us"] = 1.0e6 * float(value)
     return result | {"work_p99_of_tick": result["work_p99_us"] / (1.0e6 * period)}

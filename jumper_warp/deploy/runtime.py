@@ -6,6 +6,7 @@ depends on nothing but its arguments and the received frames, so that a log repl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
@@ -29,6 +30,7 @@ default pose; DAMP: motors brake; LANDING: a fault in flight, the landing pose u
 Request = IntEnum("Request", "NONE PASSIVE STAND CONFIRM HOLD WALK JUMP_UP JUMP_TO STOP ZERO JOINT", start=0)
 """Requests of the operator. STAND enables the motors, which brake; CONFIRM stands up, and in HOLD tests legs' signs.
 ZERO makes the present angle of a joint, values[0], its zero, in PASSIVE; JOINT moves a joint, in HOLD on a stand."""
+NO_REQUEST: tuple[Request, Any] = (Request.NONE, ())
 SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to": (State.JUMP_TO, Jump)}
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
 JUMP_OF_REQUEST = {Request.JUMP_UP: State.JUMP_UP, Request.JUMP_TO: State.JUMP_TO}
@@ -68,6 +70,8 @@ class Runtime:
         self.listener: Callable[[np.ndarray], Any] | None = None  # called with the record of every tick
         self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
         self.motion = Motion(settings["switch"])
+        folded = np.array(settings["stand_up"]["folded"], np.float32).reshape(12)
+        self._stand_up = ([folded, bundle.default], float(settings["stand_up"]["seconds"]))
         self.skills: dict[State, Skill] = {}
         for name, policy in bundle.policies.items():
             fields = settings["policies"][name]
@@ -83,6 +87,7 @@ class Runtime:
         self.record = np.zeros((), TICK)
         self.estimate = UNKNOWN
         self.pending: tuple[State, np.ndarray] | None = None  # jump that waits until walking has come to rest
+        self._request = NO_REQUEST  # of a tick with a fault
         self._procedure: Any = None
         self._target = bundle.default.copy()
         self._gains = bundle.hold
@@ -105,7 +110,7 @@ class Runtime:
         self.link.send(record["sent"])
         record["received"] = self.link.collect()
         record["late"], record["request"] = late, request
-        record["values"] = [*values, 0.0, 0.0, 0.0][:3]
+        record["values"] = [*values, 0.0, 0.0, 0.0][:3] if len(values) else 0.0
         self.frames = self._next(record)
         self._time += self._step
         if self.listener is not None:
@@ -126,8 +131,10 @@ class Runtime:
             frames = self._commands()
         elif self.safety.fault and self.state not in DRIVERLESS:
             frames = self.frames  # the last safe target
+            self._request = (request, values) if request else self._request
         else:
-            self._requests(request, values)
+            self._requests(*((request, values) if request else self._request))
+            self._request = NO_REQUEST
             self._act()
             frames = self._commands()
         record["state"], record["target"] = self.state, self._target
@@ -146,7 +153,8 @@ class Runtime:
         if self.ready and self.state == State.PASSIVE:
             self._rest_ticks = min(self._rest_ticks + 1, REST_TICKS)
             self._rest += (np.concatenate([self.gyro, self.accel, self.q]) - self._rest) / self._rest_ticks
-            self.source.reset(self._rest[:3], self._rest[3:6], self._rest[6:])
+            if self._rest_ticks == 1 or record["request"] == Request.STAND:
+                self.source.reset(self._rest[:3], self._rest[3:6], self._rest[6:])
         if self.ready:
             if received["sensor_fresh"][2:].all():
                 self.source.receive(received["sensor"][2:])
@@ -162,7 +170,7 @@ class Runtime:
         self.motion.update(self.estimate, self.gyro, self.q, self.qd)
         flies = not self._contact.any() and self.state in JUMPS
         lies = self.state in (State.STAND_UP, State.PASSIVE)
-        tilt = 0.0 if lies or flies else float(np.arccos(np.clip(-self.motion.gravity[2], -1.0, 1.0)))
+        tilt = 0.0 if lies or flies else math.acos(max(-1.0, min(1.0, -float(self.motion.gravity[2]))))
         limit = np.maximum(self._gains.limit, np.abs(self._asked))
         target, kp, kd = self._driven
         self._asked = motor_torque(target, self.q, self.qd, Gains(kp, kd, self.bundle.curve.peak), self.bundle.curve)
@@ -194,9 +202,7 @@ class Runtime:
             self._enter(State.PASSIVE)
         elif state == State.STAND_UP:
             if request == Request.CONFIRM and self._procedure is None:
-                settings = self.bundle.settings["stand_up"]
-                poses = [np.array(settings["folded"], np.float32), self.bundle.default]
-                self._procedure = Ramp(self.q, poses, settings["seconds"], self.dt)
+                self._procedure = Ramp(self.q, *self._stand_up, self.dt)
             elif self._procedure is not None and self._procedure.done:
                 self._enter(State.HOLD)
         elif request == Request.HOLD and state == State.WALK:
@@ -224,6 +230,7 @@ class Runtime:
     def _enter(self, state: State, values: Any = (0.0, 0.0, 0.0)) -> None:
         """Change the state; values: of the request that a skill takes."""
         self.pending = None
+        self._request = NO_REQUEST
         self._procedure = None
         self._finite = True
         self.state = state

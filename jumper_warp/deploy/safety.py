@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 FEW_ERRORS = 3  # Error frames of a tick that are no fault; nor is one lost frame of a motor or of the IMU
+some = np.count_nonzero  # whether one of an array is true: faster than np.any
 HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last target
 
 
@@ -33,11 +34,11 @@ class Safety:
 
     def __init__(self, settings: Mapping[str, Any], transversal_sum: Sequence[float]) -> None:
         """Read the section safety of deploy.yaml; transversal_sum: limits of outer + inner angle [deg]."""
-        self._limits = settings
-        lower, upper = np.radians(settings["lower"]), np.radians(settings["upper"])
-        margin = np.radians(settings["position_margin"])
-        self._lower, self._upper = lower - margin, upper + margin  # (12,) [rad]
-        self._sum = np.radians(transversal_sum) + [-margin, margin]
+        names = ("torque_factor", "torque_margin", "max_temperature", "max_rate", "max_tilt", "max_late")
+        self._limits = {name: float(settings[name]) for name in names}
+        margin, (low, high) = np.radians(settings["position_margin"]), transversal_sum
+        self._lower = np.radians([*settings["lower"], *4 * [low]]) - margin  # (16,) [rad] of joints, and of legs' sums
+        self._upper = np.radians([*settings["upper"], *4 * [high]]) + margin
         self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted
@@ -54,23 +55,23 @@ class Safety:
         signs has failed.
         """
         limits = self._limits
-        self._ages = np.where([*received["motor_fresh"], not stale], 0, self._ages + 1)
-        strained = (np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"]).any()
-        sums = q.reshape(4, 3)[:, 1:].sum(axis=1)
-        beyond = ((q < self._lower) | (q > self._upper)).any() or ((sums < self._sum[0]) | (sums > self._sum[1])).any()
+        self._ages += 1
+        self._ages[:12][received["motor_fresh"]] = 0
+        self._ages[12] *= stale
+        angles = np.concatenate([q, q[1::3] + q[2::3]])
         found = (
             (Fault.STOP, stop),
             (Fault.WRONG_ID, received["unknown"] > 0),
-            (Fault.MOTOR_ERROR, (error != 0).any()),
-            (Fault.TEMPERATURE, (temperature > limits["max_temperature"]).any()),
-            (Fault.SPEED, (np.abs(qd) > limits["max_rate"]).any()),
-            (Fault.POSITION, beyond),
+            (Fault.MOTOR_ERROR, some(error)),
+            (Fault.TEMPERATURE, some(temperature > limits["max_temperature"])),
+            (Fault.SPEED, some(np.abs(qd) > limits["max_rate"])),
+            (Fault.POSITION, some((angles < self._lower) | (angles > self._upper))),
             (Fault.TILT, tilt > np.radians(limits["max_tilt"])),
-            (Fault.BUS_OFF, received["bus_off"].any()),
+            (Fault.BUS_OFF, some(received["bus_off"])),
             (Fault.ERROR_FRAME, received["error_frames"] > FEW_ERRORS),
             (Fault.SILENT, self._ages[:12].max() > 1),
             (Fault.SIGN, sign),
-            (Fault.TORQUE, strained),
+            (Fault.TORQUE, some(np.abs(torque) > limits["torque_factor"] * limit + limits["torque_margin"])),
             (Fault.STALE, self._ages[12] > 1),
             (Fault.DIVERGED, diverged),
             (Fault.NOT_FINITE, not finite),

@@ -60,8 +60,8 @@ def pack_imu(gyro: np.ndarray, accel: np.ndarray, count: int) -> list[bytes]:
 
 def unpack_imu(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Return angular velocity (3,) [rad/s], specific force (3,) [m/s²] and counter of frames (2, 8) uint8."""
-    (*gyro, count), (*accel, _) = (struct.unpack("<hhhH", frame.tobytes()) for frame in frames)
-    return np.array(gyro) * GYRO_SCALE, np.array(accel) * ACCEL_SCALE, count
+    gyro, accel = np.ascontiguousarray(frames).view("<i2")
+    return gyro[:3] * GYRO_SCALE, accel[:3] * ACCEL_SCALE, int(gyro[3]) & 0xFFFF
 
 
 def pack_capture(

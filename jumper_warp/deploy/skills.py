@@ -41,7 +41,8 @@ class Motion:
 
     def __init__(self, switch: Mapping[str, float]) -> None:
         """Start without readings; switch: section of deploy.yaml, limits of a robot at rest near the default pose."""
-        self.switch = switch
+        names = ("rest_speed", "rest_spin", "rest_tilt", "max_offset")  # [m/s], [rad/s], [rad], [rad]
+        self.rest_speed, self.rest_spin, self.rest_tilt, self.max_offset = (float(switch[name]) for name in names)
         self.stood = 0  # policy steps for which all paws have been down
 
     def update(self, estimate: Estimate, gyro: np.ndarray, q: np.ndarray, qd: np.ndarray) -> None:
@@ -60,9 +61,8 @@ class Motion:
     @property
     def at_rest(self) -> bool:
         """Whether the robot stands still."""
-        switch = self.switch
-        slow = np.linalg.norm(self.velocity) < switch["rest_speed"] and np.linalg.norm(self.gyro) < switch["rest_spin"]
-        return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(switch["rest_tilt"]))
+        slow = np.linalg.norm(self.velocity) < self.rest_speed and np.linalg.norm(self.gyro) < self.rest_spin
+        return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(self.rest_tilt))
 
     def readings(self) -> dict[str, Any]:
         """Return the readings of `DeployedPolicy.targets` that do not depend on the command."""
@@ -121,7 +121,7 @@ class Walk(Skill):
         """Return whether a jump may take over; until then stand, and walk a few steps now and then."""
         self.waited += 1
         self.wanted = NUDGE * (self.waited >= NUDGE_AFTER and self.waited % NUDGE_AFTER < NUDGE_STEPS)
-        near = np.abs(motion.q - self.policy.default).max() < motion.switch["max_offset"]
+        near = np.abs(motion.q - self.policy.default).max() < motion.max_offset
         return bool(motion.at_rest and not self.velocity.any() and near)
 
 

@@ -58,13 +58,17 @@ def make_robot(bundle, simulation, tmp_path):
     robots = []
 
     def make(faults=None, source=None, **options):
+        close()
         far = BusSim(open_buses(f"unix:{tmp_path}", "robot"), faults, sim=simulation)
         options["source"] = MotionCapture() if source is None else source
         robots.append(Robot(bundle, tmp_path, far, **options))
         return robots[-1]
 
+    def close():
+        for robot in robots:
+            robot.link.close()
+            for bus in robot.far.buses:
+                bus.shutdown()
+
     yield make
-    for robot in robots:
-        robot.link.close()
-        for bus in robot.far.buses:
-            bus.shutdown()
+    close()

@@ -3,6 +3,7 @@
 import errno
 import json
 import shutil
+import socket
 import threading
 
 import can
@@ -49,6 +50,8 @@ def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
         (("safety", "damping"), []), (("policies", "vertical_jump", "observations", "angle", "scale"), []),
         (("policies", "vertical_jump", "actions", "JointPositionAction", "scale"), [1.0, 2.0]),
         (("policies", "vertical_jump", "command_filter"), {}), (("policies", "vertical_jump", "skill"), "fly"),
+        (("stand_up",), {"seconds": 2.0}), (("stand_up", "folded"), [0.0] * 4), (("stand_up", "seconds"), "two"),
+        (("switch",), {"rest_speed": 0.1}), (("safety", "max_late"), None), (("safety", "max_tilt"), []),
     ],
     ids=lambda x: x[-1] if isinstance(x, tuple) else "",
 )  # fmt: skip
@@ -81,6 +84,25 @@ def test_bus_without_a_folder_is_refused(bundle_folder, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     assert "bus must be" in refusal(capsys, bundle_folder, "--bus", "unix:", "--seconds", 0.01)
     assert not list(tmp_path.iterdir())
+
+
+def test_folder_of_a_running_process_is_refused(bundle_folder, tmp_path, capsys):
+    first = bus.open_buses(f"unix:{tmp_path}/bus")
+    for _ in range(2):
+        assert "another process uses" in refusal(capsys, bundle_folder, "--bus", f"unix:{tmp_path}/bus")
+    other = bus.open_buses(f"unix:{tmp_path}/bus", "robot")
+    other[0].send(bus.data_frame(1, b"frame"))
+    assert bytes(first[0].recv(10.0).data) == b"frame"  # still connected
+    for each in [*first, *other]:
+        each.shutdown()
+
+
+def test_sockets_of_a_dead_process_are_replaced(tmp_path):
+    for number in range(4):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
+            dead.bind(str(tmp_path / f"host{number}"))
+    for each in bus.open_buses(f"unix:{tmp_path}"):
+        each.shutdown()
 
 
 def test_log_that_exists_is_kept(bundle_folder, tmp_path, capsys):

@@ -185,9 +185,21 @@ def test_swapped_cables_fail_the_sign_test(make_robot):
             records += robot.run(1)
         assert (robot.runtime.reason == Fault.SIGN) == fails, legs
         assert robot.runtime.state == (State.DAMP if fails else State.HOLD)
-        robot.link.close()
-        for bus in robot.far.buses:
-            bus.shutdown()
+
+
+def test_request_in_a_tick_with_a_fault_is_kept(make_robot):
+    """Two lost replies of a motor are a fault; a velocity that the operator requests then is commanded after it."""
+    robot = make_robot()
+    robot.stand()
+    robot.run(24, Request.WALK, (0.3, 0.0, 0.0))
+    robot.far.silent = {4}
+    robot.run(1)
+    robot.run(1, Request.WALK, (0.5, 0.0, 0.2))
+    assert robot.runtime.safety.fault == Fault.SILENT
+    robot.far.silent = set()
+    robot.run(1)
+    assert robot.runtime.state == State.WALK
+    assert robot.runtime.skill.wanted == pytest.approx([0.5, 0.0, 0.2])
 
 
 def test_wrong_firmware_keeps_the_motors_off(make_robot):
