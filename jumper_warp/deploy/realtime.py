@@ -15,12 +15,11 @@ import numpy as np
 
 SPIN = 1.0e-4  # [s] before each tick without sleeping; a loop without sleep would be throttled by the kernel
 PRIORITY = 80  # of SCHED_FIFO
-LOCK_ALL = 3  # present and future pages, of mlockall
 
 
 def request_real_time() -> None:
     """Give the process the real-time priority PRIORITY and keep its memory in place, or print a warning."""
-    ctypes.CDLL(None).mlockall(LOCK_ALL)
+    ctypes.CDLL(None).mlockall(3)  # present and future pages
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (PermissionError, AttributeError) as error:
