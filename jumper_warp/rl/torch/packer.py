@@ -55,73 +55,49 @@ class BatchPacker:
     @torch.no_grad()
     def pack(self) -> None:
         """Compute advantages and returns, write the samples to `rows`, and update the normalisation statistics."""
-        scalings = self._scalings()  # those that actor and critic used in the rollout
+        model = self._model
+        moments = (model.obs_moments, model.critic_moments, model.value_moments)
+        scalings = Scalings(*(each.scaling() for each in moments))  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
-        advantage_scaling = update_statistics(self._model, estimates.moments, self._obs_mirror, self._cfg)
-        self._pack(scalings, estimates, advantage_scaling)
+        advantage_scaling = update_statistics(model, estimates.moments, self._obs_mirror, self._cfg)
+        self._write_rows(scalings, estimates, advantage_scaling)
         self.old_log_std.copy_(self._rollout.log_std)
 
-    def _scalings(self) -> Scalings:
-        """Return the current mean and standard deviation of observations and values."""
-        model = self._model
-        return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
-
     def _estimates(self, scalings: Scalings) -> Estimates:
-        """Compute values, advantages and returns of the rollout."""
-        return compute_values_and_gae(self._rollout, self._model, scalings, self._cfg, self._chunk_size)
+        """Return values, advantages and returns (num_steps · num_envs,) of the rollout, and moments of its samples.
 
-    def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Write the rollout's samples with values, advantages and returns to `rows`; arguments: see `write_rows`."""
-        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
-        write_rows(
-            self.rows, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
-            self._chunk_size,
-        )  # fmt: skip
+        A timeout adds the discounted value of the final observation: the episode was cut, and would have earned more.
+        """
+        buffer, model, cfg = self._rollout, self._model, self._cfg
 
+        def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
+            """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
+            chunks = self._chunks(critic_obs.flatten(0, 1))
+            heads = [model.value_head(scalings.critic_obs.features(chunk)) for chunk in chunks]
+            return torch.cat(heads).view(critic_obs.shape[:2])
 
-def compute_values_and_gae(
-    buffer: RolloutBuffer, model: ActorCritic, scalings: Scalings, cfg: PpoCfg, chunk_size: int | None
-) -> Estimates:
-    """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
+        head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
+        value, final_value = scalings.value.denormalise(head), scalings.value.denormalise(final_head)
+        reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
+        advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
+        samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
+        moments = RolloutMoments(*(Moments.from_samples(x, self._chunk_size) for x in samples))
+        return Estimates(head[:-1].flatten(), advantage, target, moments)
 
-    A timeout adds the discounted value of the final observation: the episode was cut, and would have earned more.
-    chunk_size: samples per evaluation of the critic.
-    """
+    def _write_rows(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
+        """Normalise the rollout's training samples, and write them to `rows`, one per row."""
+        buffer = self._rollout
+        target = estimates.target
+        if self._cfg.normalise_value:
+            target = self._model.value_moments.scaling().normalise(target)
+        steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
+        pieces = [self.rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
+        for out, obs, critic_obs, action, mean, *estimated in zip(*map(self._chunks, pieces), strict=True):
+            features = scalings.obs.features(obs)
+            critic_features = scalings.critic_obs.features(critic_obs)
+            log_prob = gaussian_log_prob(action, mean, buffer.log_std)
+            out.copy_(Batch(features, critic_features, action, mean, log_prob, *estimated).rows())
 
-    def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
-        """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
-        scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
-        heads = [model.value_head(scaling.features(chunk)) for chunk in chunks]
-        return torch.cat(heads).view(critic_obs.shape[:2])
-
-    head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
-    value, final_value = scalings.value.denormalise(head), scalings.value.denormalise(final_head)
-    reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
-    advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
-    samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
-    moments = RolloutMoments(*(Moments.from_samples(x, chunk_size) for x in samples))
-    return Estimates(head[:-1].flatten(), advantage, target, moments)
-
-
-def write_rows(
-    rows: torch.Tensor, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
-    advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
-) -> None:  # fmt: skip
-    """Normalise a rollout's training samples, and write them to `rows` (batch, columns of `layout`), one per row.
-
-    chunk_size: samples packed at a time (None: all).
-    scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.
-    """
-    target = estimates.target if target_scaling is None else target_scaling.normalise(estimates.target)
-    steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
-    pieces = [rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
-    for out, obs, critic_obs, action, mean, *estimated in zip(*[_chunks(x, chunk_size) for x in pieces], strict=True):
-        features = scalings.obs.features(obs)
-        critic_features = scalings.critic_obs.features(critic_obs)
-        log_prob = gaussian_log_prob(action, mean, buffer.log_std)
-        out.copy_(Batch(features, critic_features, action, mean, log_prob, *estimated).rows())
-
-
-def _chunks(x: torch.Tensor, chunk_size: int | None) -> tuple[torch.Tensor, ...]:
-    """Split x (batch, ...) into views of `chunk_size` rows, the last with the remainder; None: one view of all rows."""
-    return x.split(chunk_size or x.shape[0])
+    def _chunks(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Split x (batch, ...) into views of rows that fit a CPU's caches, the last with the remainder."""
+        return x.split(self._chunk_size or x.shape[0])

@@ -84,45 +84,24 @@ class Collector:
         rollout.critic_obs[-1] = self._critic_obs
 
     def _act_step(self, step: RolloutBuffer) -> None:
-        """Sample actions for the current state; write them, mean and observations to `step` (`RolloutBuffer.at`)."""
-        sample_action(self.env.obs, self._critic_obs, step, self._model, self._scaling)
+        """Sample every world's action; write it, its mean and the observations to `step` (`RolloutBuffer.at`).
+
+        The action of `step` holds standard normal noise on entry.
+        """
+        step.obs.copy_(self.env.obs)
+        step.critic_obs.copy_(self._critic_obs)
+        mean = self._model.mean(self._scaling.features(self.env.obs))
+        step.mean.copy_(mean)
+        step.action.mul_(self._model.log_std.exp()).add_(mean)
 
     def _record_step(self, step: RolloutBuffer) -> None:
-        """Write the environment's last reward, end and final observation to `step` (`RolloutBuffer.at`)."""
-        env, scale = self.env, self.cfg.reward_scale
-        final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
-        record_transition(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
-
-
-def sample_action(
-    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, model: ActorCritic, scaling: Scaling
-) -> None:
-    """Sample every world's action from the policy, and write it, its mean and the observations to `step`.
-
-    obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
-    scaling: normalises obs.
-    """
-    step.obs.copy_(obs)
-    step.critic_obs.copy_(critic_obs)
-    mean = model.mean(scaling.features(obs))
-    step.mean.copy_(mean)
-    step.action.mul_(model.log_std.exp()).add_(mean)
-
-
-def record_transition(
-    reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
-    step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
-) -> None:  # fmt: skip
-    """Write the results of an environment step to `step` of the rollout; update returns and lengths of episodes.
-
-    reward, done, timeout: (num_envs,), unscaled; final_critic_obs: (num_envs, n). episode: (2, num_envs) and finished:
-    (3, num_envs), as in `Collector`, are updated in place with unscaled rewards.
-    """
-    reward = torch.nan_to_num(reward, nan=0.0, posinf=0.0, neginf=0.0)
-    step.reward.copy_(reward * reward_scale)
-    step.done.copy_(done)
-    step.timeout.copy_(timeout)
-    step.final_critic_obs.copy_(final_critic_obs)
-    running = episode + torch.stack([reward, torch.ones_like(reward)])
-    finished.add_(torch.cat([running * done, done[None].double()]))
-    episode.copy_(running * (1.0 - done))
+        """Write the results of an environment step to `step`; update returns and lengths of episodes, unscaled."""
+        env = self.env
+        reward = torch.nan_to_num(env.reward, nan=0.0, posinf=0.0, neginf=0.0)
+        step.reward.copy_(reward * self.cfg.reward_scale)
+        step.done.copy_(env.done)
+        step.timeout.copy_(env.timeout)
+        step.final_critic_obs.copy_(self._final_critic_obs)
+        running = self.episode + torch.stack([reward, torch.ones_like(reward)])
+        self.finished.add_(torch.cat([running * env.done, env.done[None].double()]))
+        self.episode.copy_(running * (1.0 - env.done))
