@@ -54,8 +54,10 @@ def test_start_modes_have_the_tasks_probabilities(env):
     edit_episodes(env, level=np.arange(N) % len(env.task.levels))
     env.reset()
     fractions = np.bincount(episodes_of(env)["start_mode"], minlength=6) / N
+    shares = {"horizontal-jump": [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]}
+    shares["horizontal-jump-standing"] = [0.30, 0.15, 0.15, 0.10, 0.20, 0.10]
     # 0.02: default poses in place of samples that are invalid in all attempts
-    assert np.abs(fractions - [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
+    assert np.abs(fractions - shares[env.task.name]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
 
 
 @pytest.mark.parametrize("start_mode", START_MODES)
@@ -105,7 +107,7 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
     for number, level in enumerate(env.task.levels):
         here = ahead[sample.level == number]
         for axis in (X, Y):
-            assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.05)
+            assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.1)  # some 300 goals a level
         if level.elliptical:
             half_axes = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, XY]
             radius = np.linalg.norm(here[:, XY] / half_axes, axis=1)
@@ -113,12 +115,17 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
     assert not sample.episodes["goal"][:, Z].any()
 
 
-def test_phases_and_the_command_fit_the_start_mode(starts):
+def test_phases_and_the_command_fit_the_start_mode(env, starts):
     for start_mode, phase in zip(START_MODES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
         episodes = starts[start_mode].episodes
         assert (episodes["phase"] == int(phase)).all()
         if start_mode in ("standing", "default"):
-            assert set(episodes["command_step"]) == set(range(31))  # up to 0.5 s
+            settings = env.task.reset.settings
+            waits = episodes["command_step"] > 30  # longer than 0.5 s
+            assert set(episodes["command_step"][~waits]) == set(range(31))
+            share = waits.mean() / max(1.0 - 30.0 / 240.0, 1.0e-6)  # of long waits, which are 0 to 4 s
+            assert share == pytest.approx(settings.long_wait_probability, abs=0.08)
+            assert episodes["command_step"].max() <= 60.0 * settings.long_wait
         else:
             assert not episodes["command_step"].any()
         if phase == LANDED:
