@@ -7,6 +7,7 @@ robot that stands must lower its base before it jumps, as much as the jump needs
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.tasks.cfg import TaskCfg
@@ -21,7 +22,7 @@ from jumper_warp.tasks.units import DEG, SECOND
 STANCE = 12.0 * DEG  # [rad] of the thighs from the default pose: a base height of 0.35 m
 LOWEST_STANCE = 0.28  # [m] Base height below which the robot crouches
 HOLD = 5.0  # [s] Time after touchdown for which an evaluated robot must stand
-SQUAT = {"takeoff_height": 0.31, "acceleration": 50.0, "floor": 0.15}
+SQUAT: dict[str, Any] = {"takeoff_height": 0.31, "acceleration": 50.0, "floor": 0.15}
 """[m], [m/s^2], [m] Parameters of the squat that a height needs: 0.27 m for 0.5 m, 0.165 m for 1.05 m."""
 
 
