@@ -155,7 +155,7 @@ TASKS: dict[str, TaskEntry] = {
     "vertical-jump-standing": TaskEntry(f"{STANDING}vertical_jump_standing", HEIGHTS, max_iterations=6000,
                                         about="stand, and jump to a height"),
     "horizontal-jump-standing": TaskEntry(f"{STANDING}horizontal_jump_standing", PLACES, max_iterations=6000,
-                                          about="stand, and jump in any direction, also on slippery ground"),
+                                          about="stand, and jump in any direction"),
     "vertical-jump-mars": TaskEntry(f"{MARS}vertical_jump_mars", ON_MARS, ("Olympus-Vertical-Jump-Mars",),
                                     about="jump to a height, Mars"),
     "vertical-jump-mars-loose": TaskEntry(f"{MARS}vertical_jump_mars_loose", ON_MARS, about="jump up to 3.6 m, Mars"),

@@ -126,7 +126,7 @@ def test_list_shows_tasks_of_a_module_and_policies(capsys, path):
     code, out, _ = run(capsys, "list", f"--task-module={path}")
     lines = [" ".join(line.split()) for line in out.splitlines()]
     assert code == 0 and any(line.startswith("tame-jump ") for line in lines)
-    assert "vertical-jump jump to a height vertical_jump" in lines
+    assert "vertical-jump-standing stand, and jump to a height vertical_jump" in lines
 
 
 def test_training_saves_functions_by_module_and_name(runs):
