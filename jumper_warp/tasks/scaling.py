@@ -20,7 +20,7 @@ BY_NAME = {
     "std_fine": "gain", "std_wide": "gain", "std_middle": "gain", "scale_sharp": "gain", "tolerance": "gain",
     "height": "height", "distance": "leg", "target_height": "leg", "hip": "leg", "thigh": "leg", "shank": "leg",
     "speed": "speed", "speed_scale": "speed", "std_lin_vel": "speed", "takeoff_speed": "speed",
-    "weight_force": "weight",
+    "weight_force": "weight", "takeoff_height": "height", "floor": "height", "acceleration": "gain/height",
 }  # fmt: skip
 """Measure of a term's number by its name; numbers of other names, such as angles, have none."""
 OF_TERM = {
@@ -29,7 +29,8 @@ OF_TERM = {
     "advance_attitude": {"tolerance": ""}, "motor_torque_sq": {"weight": "1/torque^2"},
     "torque_ripple": {"weight": "1/torque^2"}, "joint_acceleration": {"weight": "leg^2"},
     "lin_vel_z_l2": {"weight": "1/speed^2"}, "slip": {"weight": "1/speed^2"}, "touchdown": {"weight": "1/speed^2"},
-    "foot_clearance": {"weight": "1/(leg^2 speed)"},
+    "foot_clearance": {"weight": "1/(leg^2 speed)"}, "touchdown_tracking": {"std": "gain"},
+    "squat": {"std": "height"}, "shallow_squat": {"tolerance": "height"},
 }  # fmt: skip
 """Measures of numbers of a term by the term's name, which take precedence over BY_NAME."""
 OF_FIELD = {
@@ -59,6 +60,7 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
     torque = ours.torque / theirs.torque
     factor = {
         "leg": leg, "height": ours.height / theirs.height, "speed": speed, "time": speed, "gain": gain, "": 1.0,
+        "gain/height": gain * theirs.height / ours.height,
         "mass": ours.mass / theirs.mass, "weight": ours.mass / theirs.mass, "torque": torque,
         "1/torque^2": 1.0 / torque**2, "leg^2": leg**2, "1/speed^2": 1.0 / speed**2,
         "1/(leg^2 speed)": 1.0 / (leg**2 * speed), "front_x": ours.paw_x[0] / theirs.paw_x[0],

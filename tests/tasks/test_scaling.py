@@ -45,6 +45,24 @@ def test_vertical_jump_of_a_heavy_robot_by_hand():
     assert terms["tilted"] == {term.name: term for term in usual.terminations}["tilted"]
 
 
+def test_squat_of_a_heavy_robot_is_in_its_measures():
+    robot = load_overlay("heavy")
+    ours, usual = measure(robot), jumper_measures()
+    low, gain = ours.height / usual.height, (ours.apex - ours.height) / (usual.apex - usual.height)
+    task = make_task("vertical-jump-standing", robot)
+    squat, end = (next(t for t in terms if t.name == name) for terms, name in (
+        (task.rewards, "squat"), (task.terminations, "shallow_squat")))  # fmt: skip
+    numbers = {"takeoff_height": 0.31 * low, "floor": 0.15 * low, "acceleration": 50.0 * gain / low}
+    assert squat.numbers | numbers == pytest.approx(squat.numbers) and end.numbers | numbers == pytest.approx(
+        end.numbers
+    )
+    # a way to push as long for the robot's height as the Jumper's: way = rise g / a
+    assert gain * 0.7 * 9.81 / squat.numbers["acceleration"] / ours.height == pytest.approx(
+        0.7 * 9.81 / 50 / usual.height
+    )
+    assert (squat.numbers["std"], end.numbers["tolerance"]) == pytest.approx((0.03 * low, 0.04 * low))
+
+
 def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only():
     task = make_task("velocity-flat", load_overlay("small_direct_drive"))
     settings = task.reset.settings
