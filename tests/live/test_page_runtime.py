@@ -61,8 +61,8 @@ def reference(name, goals):
 def test_apexes_are_those_of_solver_mujoco(site):
     jumps = node("jumps", site, "vertical_jump", json.dumps([{"height": height} for height in HEIGHTS]))
     outcome, _ = reference("vertical_jump", np.array(HEIGHTS))
-    # 0.02 m: small differences grow in flight
-    assert [jump["apex"] for jump in jumps] == pytest.approx(outcome.apex_m[:, 0], abs=0.02)
+    # [m] MuJoCo's apexes of this policy spread by 4 to 11 mm if the start changes by 1e-7 m; its landings are calmer
+    assert [jump["apex"] for jump in jumps] == pytest.approx(outcome.apex_m[:, 0], abs=0.03)
 
 
 def test_landings_are_those_of_solver_mujoco(site):

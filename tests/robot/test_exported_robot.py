@@ -39,7 +39,8 @@ def test_jump_in_mujoco_reaches_its_height_with_closed_loops(exported, rate, gap
     pytest.importorskip("onnxruntime")
     apex, largest_gap = jump_in_mujoco(rate)
     assert largest_gap < gap
-    assert apex == pytest.approx(apex_in_solver_mujoco(rate), abs=0.02)  # [m]; small differences grow in flight
+    # [m] MuJoCo's apexes of this policy spread by 4 to 11 mm if the start changes by 1e-7 m
+    assert apex == pytest.approx(apex_in_solver_mujoco(rate), abs=0.03)
 
 
 def jump_in_mujoco(rate):
