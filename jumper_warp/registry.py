@@ -120,6 +120,7 @@ WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, s
 HEIGHTS = PpoCfg(gamma=0.99)  # Training of vertical jumps
 ON_MARS = replace(HEIGHTS, symmetry="actor")
 """PPO settings for vertical jumps on Mars, with symmetry: in long flights even a slow rotation turns the robot far."""
+FROM_STANCE = replace(ON_MARS, final_entropy_coef=0.0003)  # Training of vertical jumps by a robot that stands
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
 SCORE = "Metrics/score"  # Key of the log by which checkpoints of walks are selected
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
@@ -152,7 +153,7 @@ TASKS: dict[str, TaskEntry] = {
         presets={"laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --max-iterations 400"},
     ),
     "horizontal-jump-sighted": TaskEntry(f"{AHEAD}horizontal_jump_sighted", PLACES, about="jump off and onto blocks"),
-    "vertical-jump-standing": TaskEntry(f"{STANDING}vertical_jump_standing", HEIGHTS, max_iterations=6000,
+    "vertical-jump-standing": TaskEntry(f"{STANDING}vertical_jump_standing", FROM_STANCE, max_iterations=6000,
                                         about="stand, and jump to a height"),
     "horizontal-jump-standing": TaskEntry(f"{STANDING}horizontal_jump_standing", PLACES, max_iterations=6000,
                                           about="stand, and jump in any direction"),

@@ -22,6 +22,8 @@ from jumper_warp.tasks.units import DEG, SECOND
 STANCE = 12.0 * DEG  # [rad] of the thighs from the default pose: a base height of 0.35 m
 LOWEST_STANCE = 0.28  # [m] Base height below which the robot crouches
 HOLD = 5.0  # [s] Time after touchdown for which an evaluated robot must stand
+FRICTION = RandomizationCfg(static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
+"""Random robots whose paws also stand on slippery ground."""
 SQUAT: dict[str, Any] = {"takeoff_height": 0.31, "acceleration": 50.0, "floor": 0.15}
 """[m], [m/s^2], [m] Parameters of the squat that a height needs: 0.27 m for 0.5 m, 0.165 m for 1.05 m."""
 
@@ -52,6 +54,7 @@ def vertical_jump_standing() -> TaskCfg:
             *task.rewards,
             RewardTerm(rewards.squat, 100.0, std=0.03, scale_by_dt=False, **SQUAT),
             RewardTerm(rewards.tracking, 40.0, std_wide=0.15, std_fine=0.03, fine_weight=0.6),
+            RewardTerm(rewards.touchdown_tracking, 120.0, std=0.05, scale_by_dt=False),
         ),
         terminations=(
             *task.terminations,
@@ -59,12 +62,14 @@ def vertical_jump_standing() -> TaskCfg:
             TerminationTerm(terminations.turned_touchdown, rotation=25.0 * DEG, yaw=15.0 * DEG),
         ),
         levels=heights((0.45, 0.70), (0.45, 0.95), (0.45, 1.15)),
+        randomization=replace(FRICTION, zero_latency_probability=0.1),
         evaluation=HeightEvaluation(hold=HOLD),
     )
     task = task.with_terms("terminations", moved_away={"distance": 0.25})
     return task.with_terms(
-        "rewards", jump_height={"weight": 80.0}, ground_posture={"weight": 40.0, "std": 20.0 * DEG, "shift": STANCE}
-    )
+        "rewards", jump_height={"weight": 80.0, "scale_sharp": 0.025}, estimated_jump_height={"scale_sharp": 0.025},
+        horizontal_velocity={"weight": 25.0}, ground_posture={"weight": 40.0, "std": 20.0 * DEG, "shift": STANCE},
+    )  # fmt: skip
 
 
 def level_all_around(ahead: float, around: float) -> Level:
@@ -103,7 +108,7 @@ def horizontal_jump_standing() -> TaskCfg:
             RewardTerm(rewards.folded_legs, -200.0, angle=110.0 * DEG),
         ),
         levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
-        randomization=RandomizationCfg(static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9)),
+        randomization=FRICTION,
         evaluation=PlaceEvaluation(hold=HOLD),
     )
     return task.with_terms(
