@@ -16,7 +16,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "gym", "envs.rsl_rl", "envs.sb3",
     )),
     "simulation": ("Simulation and solvers", (
-        "sim.simulation", "sim.solver", "sim.mujoco", "sim.dynamics",
+        "sim.simulation", "sim.solver", "sim.mujoco", "sim.dynamics", "sim.model_parts",
     )),
     "robot": ("Robot", (
         "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.bounds", "robot.grounds",

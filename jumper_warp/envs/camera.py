@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.robot.model import GROUND_COLOR, build_model
-from jumper_warp.sim.dynamics import find_ground
+from jumper_warp.sim.model_parts import find_ground
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.viz.film import DIRECTION

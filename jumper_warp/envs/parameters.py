@@ -7,7 +7,7 @@ import warp as wp
 
 from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.kernels.mdp.parameters import RobotParameters
-from jumper_warp.sim.dynamics import find_paws
+from jumper_warp.sim.model_parts import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves

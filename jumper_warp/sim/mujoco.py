@@ -16,7 +16,8 @@ from jumper_warp.kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
 from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
 from jumper_warp.robot.model import KNEE_DOFS, LOOP_IMPEDANCE, PAWS, PHYSICS_DT, other_colliders
-from jumper_warp.sim.dynamics import LINKS, TOLERANCE, JumperDynamics, WorldRange
+from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange
+from jumper_warp.sim.model_parts import LINKS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.newton_types import Control, Model, State

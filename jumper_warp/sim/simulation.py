@@ -22,15 +22,8 @@ from jumper_warp.robot.model import PHYSICS_DT, Extras, build_model
 from jumper_warp.robot.motors import FilterCfg, MotorCfg, filter_params, jumping_motors, motor_arrays
 from jumper_warp.robot.overlay import RobotOverlay, robots_of
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.sim.dynamics import (
-    TOLERANCE,
-    JumperDynamics,
-    WorldRange,
-    check_step,
-    check_worlds,
-    slices_of,
-    warn_of_colliders,
-)
+from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange, check_step, check_worlds, slices_of
+from jumper_warp.sim.model_parts import warn_of_colliders
 from jumper_warp.sim.mujoco import MujocoDynamics
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.arrays import real_array

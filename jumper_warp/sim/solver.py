@@ -15,7 +15,8 @@ from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
 from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, paw_contacts_kernel
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, check_step, warn_of_colliders
+from jumper_warp.sim.dynamics import MAX_SWEEPS, TOLERANCE, JumperDynamics, check_step
+from jumper_warp.sim.model_parts import warn_of_colliders
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.checks import check_finite, check_type
 from jumper_warp.utils.errors import InputError

@@ -8,7 +8,7 @@ import warp as wp
 from jumper_warp.kernels.terrain import ground as ground_module
 from jumper_warp.kernels.terrain.ground import Ground, surface
 from jumper_warp.robot.model import build_model
-from jumper_warp.sim.dynamics import find_ground, ground_struct
+from jumper_warp.sim.model_parts import find_ground, ground_struct
 
 wp.set_module_options({"enable_backward": False})
 

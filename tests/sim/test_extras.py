@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from columns import DOFS, MOTOR_DOFS
 from jumper_warp.robot.model import build_model
-from jumper_warp.sim.dynamics import NotThisRobotError
+from jumper_warp.sim.model_parts import NotThisRobotError
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
