@@ -28,7 +28,7 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorials" / "on_a_robot.md"
-COMMAND_STEP, HEIGHT = 30, 0.9  # policy step of the command to jump; commanded base height [m]
+COMMAND_STEP, HEIGHT = 30, 0.95  # policy step of the command to jump; commanded base height [m]
 
 
 def without_history(policy, readings):
@@ -37,18 +37,11 @@ def without_history(policy, readings):
     return readings
 
 
-def without_filter(policy, readings):
-    """Disable the policy's command filter; return the readings unchanged."""
-    policy.filter_targets = lambda target, angle, rate: target
-    return readings
-
-
 MISTAKES = {
-    "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.599),
-    "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.397),
-    "no history": (without_history, 0.812),
-    "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.790),
-    "no filter": (without_filter, 0.931),
+    "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.748),
+    "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.395),
+    "no history": (without_history, 0.785),
+    "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.805),
 }
 """Mistakes of a deployment program by name: a function that makes it, and the apex [m]."""
 
@@ -94,7 +87,7 @@ def simulated_robot(lateral_torque):
 
 def test_jump_to_a_height_reaches_it():
     apex, _ = jump()
-    assert apex == pytest.approx(HEIGHT, abs=0.004)  # [m]; 0.9027
+    assert apex == pytest.approx(HEIGHT, abs=0.004)  # [m]; 0.9510
 
 
 def test_jump_to_a_place_ends_there():
