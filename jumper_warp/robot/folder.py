@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -243,7 +242,7 @@ def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
 
 def is_finite(value: Any) -> bool:
     """Return whether a value is a number, no bool, and finite in float32."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= FLOAT32_MAX
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FLOAT32_MAX
 
 
 def _motor(name: str, rows: Any) -> Motor:
