@@ -13,6 +13,7 @@ import io
 import itertools
 import os
 import shutil
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
@@ -230,6 +231,7 @@ def run_command(command: Callable[[], object]) -> None:
             raise
         sys.stdout.flush()
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # another Ctrl-C ends the process at once, without a traceback
         raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         discard_output()

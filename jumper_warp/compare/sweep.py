@@ -89,6 +89,8 @@ class Sweep:
                 number = IntDistribution if whole else FloatDistribution
                 kind: Any = CategoricalDistribution if "choices" in spec else number
                 kinds[name] = kind(**spec)
+                for choice in spec.get("choices", ()):
+                    shlex.split(str(choice))  # as in `arguments`
             except (TypeError, ValueError, AttributeError) as error:
                 raise InputError(f"parameter {name}: {error}") from error
             check_finite(f"parameter {name}", *(value for value in spec.values() if isinstance(value, float)))

@@ -82,6 +82,8 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     rate = options.rate or bundle.settings.get("rate")
     if rate not in RATES or not options.seconds > 0.0:
         raise InputError(f"the rate must be 480 or 500 Hz and seconds above 0, got {rate} and {options.seconds}")
+    if not np.isfinite([options.height, *options.place]).all():
+        raise InputError(f"height and place must be finite, got {options.height} and {options.place}")
     pump = (lambda: None) if options.lockstep else None
     with bundle.reading():
         link = Link([], reply_id=bundle.settings["can"]["reply_id"], deadline=0.6 / rate, pump=pump)

@@ -353,12 +353,12 @@ def save_policy(
         new.mkdir()
         write_files(new, content, {})
         with directory_lock(folder.parent):
-            if folder.exists():
-                os.replace(folder, old)
             try:
+                if folder.exists():
+                    os.replace(folder, old)
                 os.replace(new, folder)
             except BaseException:
-                if old.exists():
+                if not folder.exists() and old.exists():
                     os.rename(old, folder)
                 raise
     return folder

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -36,6 +36,7 @@ from jumper_warp.robot.parts import (
     make_read_only,
 )
 from jumper_warp.robot.urdf import UrdfReader, quat_from_rpy
+from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_json, write_atomically
 
@@ -160,6 +161,9 @@ def robot_of(table: Json) -> RobotDescription:
         raise InputError(f"not a robot table: expected an object with schema {SCHEMA!r}")
     if unknown := set(table) - {"schema", "name", "about", "motors", *SECTIONS, *LEGS}:
         raise InputError(f"unknown section {min(unknown)!r:.60}: {ELSEWHERE}")
+    for name in ("motors", *LEGS):
+        if not isinstance(table.get(name, {}), dict):
+            raise InputError(f"section {name!r} must be an object, got {table[name]!r:.40}")
     read = {name: _values(name, table.get(name), units) for name, units in SECTIONS.items()}
     motors = {name: _motor(name, rows) for name, rows in table.get("motors", {}).items()} | {"locked": LOCKED}
     body, common = read["body"], read["legs"]
@@ -224,9 +228,9 @@ def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
         if name.endswith("_motor"):
             fits = isinstance(value, str)
         else:
-            array = np.array(value, dtype=float if np.size(value) == size else object)
-            fits = array.dtype == float and np.isfinite(array).all() and array.ndim == (size > 1)
-            value = array if size > 1 else value
+            numbers = [value] if size == 1 else value
+            fits = isinstance(numbers, Sequence) and len(numbers) == size and all(map(is_finite, numbers))
+            value = np.array(value, dtype=float) if fits and size > 1 else value
         if not fits or (size == 1 and not isinstance(value, str) and value < 0.0):
             wanted = "the name of a motor" if name.endswith("_motor") else f"{size} finite number{'s' * (size > 1)}"
             raise InputError(
@@ -234,6 +238,11 @@ def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
             )
         values[name] = value
     return values
+
+
+def is_finite(value: Any) -> bool:
+    """Return whether a value is a number, no bool, and finite in float32."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FLOAT32_MAX
 
 
 def _motor(name: str, rows: Any) -> Motor:

@@ -22,8 +22,8 @@ LARGEST = 1.0e9  # Largest absolute value of a term's number
 SMALLEST_WIDTH = 1.0e-6  # Of a reward kernel, in its unit; float32 can hold its square
 DURATION = re.compile(r"(\w+_)?steps|settle|interval_range_s")
 WIDTH = re.compile(r"(std|width)(_\w+)?")
-DIVISOR = re.compile(r"scale(_\w+)?|speed_scale|limit|angle|weight_force")
-"""Names of parameters by which the project's rewards divide, in addition to WIDTH."""
+DIVISOR = re.compile(r"scale(_\w+)?|speed_scale|limit|angle|weight_force|acceleration")
+"""Names of parameters by which the project's rewards and terminations divide, in addition to WIDTH."""
 PROBABILITY = re.compile(r"(\w+_)?probability")
 
 EVENT_RANGES: dict[Function, dict[str, tuple[str, float]]] = {

@@ -81,7 +81,7 @@ class Term(Copyable):
             if key not in known and key not in self.options:
                 raise InputError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
         self.numbers = {key: values.get(key, default) for key, default in known.items()}
-        divides = "weight" in self.settings and not is_own(func)
+        divides = isinstance(self, RewardTerm | TerminationTerm) and not is_own(func)
         for key, value in self.numbers.items():
             if value is REQUIRED:
                 raise InputError(f"{where}: parameter {key!r} is missing")

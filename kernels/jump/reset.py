@@ -145,23 +145,23 @@ def begin_jump(
 
 
 @wp.func
-def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
+def begin_next_jump(robot: RobotView, old: JumpState, ground: Ground, goal: wp.vec3, heading: float) -> JumpState:
     """Return the task state in which the next jump of an episode begins, commanded at once.
 
-    goal [m]: x, y relative to base position `pos` [m] and `heading` [rad], and base height at the apex, world z.
+    goal [m]: x, y relative to base position and `heading` [rad], and base height at the apex, world z.
     """
     state = old
     state.heading = heading
-    state.goal = rotate_yaw(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
+    state.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     state.goal_ground = surface(ground, state.goal[0], state.goal[1])[0]
-    state.start = pos
+    state.start = robot.pos
     state.phase = STANCE
     state.phase_steps = 0
     state.command_step = old.steps
     state.apex_passed = 0
     state.idle_steps = 0
-    state.max_height = pos[2]
-    state.squat = pos[2]
+    state.max_height = robot.pos[2]
+    state.squat = robot.height
     state.peak_tilt = 0.0
     state.paws_landed = 0
     state.next_jump_step = 0
@@ -226,7 +226,7 @@ def next_jump_due(state: JumpState) -> bool:
 def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
     """Return the state of an episode's next jump, whose goal is sampled from `level`."""
     goal = sample_goal(rng, level)
-    new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
+    new = begin_next_jump(robot, state, world_ground(scene.ground, robot.world), goal, yaw_of(robot.quat))
     new.next_jump_step = sample_next_jump_step(rng, state.next_jump_delay, level.next_jump_probability)
     return new
 
@@ -241,7 +241,7 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
     here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
     if state.phase == LANDED:
-        return begin_next_jump(state, here, goal, robot.pos, heading)
+        return begin_next_jump(robot, state, here, goal, heading)
     if state.phase != STANCE or state.steps > 0:
         return state
     new = JumpState()
@@ -250,6 +250,7 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
     new.goal = rotate_yaw(goal, heading) + wp.vec3(robot.pos[0], robot.pos[1], 0.0)
     new.goal_ground = surface(here, new.goal[0], new.goal[1])[0]
     new.max_height = robot.pos[2]
+    new.squat = robot.height
     new.command_step = whole_steps(values[3])
     return new
 

@@ -39,6 +39,23 @@ def test_interrupted_command_ends_with_130_and_no_traceback(tmp_path):
     assert "Traceback" not in rest
 
 
+INTERRUPTED_EXIT = """
+import atexit, os, signal
+from jumper_warp.cli.main import run_command
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+atexit.register(interrupt)
+run_command(interrupt)
+"""
+
+
+def test_a_second_interrupt_while_the_process_ends_prints_no_traceback():
+    run = subprocess.run([sys.executable, "-c", INTERRUPTED_EXIT], capture_output=True, text=True)
+    assert (run.stderr, run.returncode) == ("", -signal.SIGINT)
+
+
 INTERRUPTED_IMPORT = """
 import signal, sys
 from importlib.abc import MetaPathFinder

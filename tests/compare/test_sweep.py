@@ -201,6 +201,7 @@ def test_wrong_files_are_refused(tmp_path):
         ("trials = 2", "trials = 0", "trials must be"),
         ("{ low = 1, high = 3 }", "{ low = nan, high = 3.0 }", "ppo.epochs must be finite"),
         ("{ low = 1, high = 3 }", "{ low = 1.0, high = inf }", "ppo.epochs must be finite"),
+        ("{ low = 1, high = 3 }", "{ choices = ['\"'] }", "ppo.epochs: No closing quotation"),
         ("ppo.epochs", "seeds", "sets --seeds"),
         ("ppo.epochs", "device", "no device '"),
         ("--num-envs 8", "--run_name=x", "sets --run-name"),

@@ -80,6 +80,12 @@ def test_wrong_time_is_refused(seconds, bundle_folder, tmp_path, capsys):
     assert "seconds above 0" in refusal(capsys, bundle_folder, "--bus", f"unix:{tmp_path}/bus", f"--seconds={seconds}")
 
 
+@pytest.mark.parametrize("flags", [("--height", "nan"), ("--place", "inf", "0")])
+def test_goal_of_the_keys_that_is_not_finite_is_refused(flags, bundle_folder, tmp_path, capsys):
+    bus = ("--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
+    assert "height and place must be finite" in refusal(capsys, bundle_folder, *bus, *flags)
+
+
 def test_bus_without_a_folder_is_refused(bundle_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert "bus must be" in refusal(capsys, bundle_folder, "--bus", "unix:", "--seconds", 0.01)
@@ -219,7 +225,9 @@ def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
     assert (folder / "jumper.dbc").read_bytes() == (bundle_folder / "jumper.dbc").read_bytes()
 
 
-@pytest.mark.parametrize("flag", [("--rate", "0"), ("--seed", "-1")])
+@pytest.mark.parametrize(
+    "flag", [("--rate", "0"), ("--seed", "-1"), ("--drop", "2"), ("--corrupt", "-1"), ("--seconds", "-1")]
+)
 def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
     with pytest.raises(InputError, match=flag[0].strip("-")):
         bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])

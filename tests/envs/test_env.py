@@ -21,6 +21,7 @@ from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import platform
 from jumper_warp.tasks.terms import RewardTerm
 
 TASK = make_task("vertical-jump")
@@ -227,6 +228,20 @@ def test_an_evaluation_may_delay_commands_by_world(env):
     found = env.task_arrays()["command_step"]
     np.testing.assert_array_equal(found[::2], np.arange(len(found[::2])))
     assert (np.abs(found - 60.0 * delays) <= 0.5).all()
+
+
+def test_the_squat_of_a_jump_commanded_at_once_is_the_height_above_the_ground():
+    """The first jump, in the default pose, and the next one, of a base over ground of z = -0.1 m."""
+    env = make_env(1, ground=platform(-0.1, edge=0.1))
+    env.evaluation_reset([0.0, 0.0, 0.8, 0.0])
+    env.step(REST[:1])
+    assert env.task_arrays()["squat"] == pytest.approx(env.task_arrays()["base_pos"][:, 2], abs=1e-6)
+    edit_coordinates(env, 0, q={0: 1.0})
+    edit_episodes(env, phase=LANDED)
+    env.step(REST[:1])
+    env.command([0.0, 0.0, 0.8, 0.0])
+    env.step(REST[:1])
+    assert env.task_arrays()["squat"] == pytest.approx(env.task_arrays()["base_pos"][:, 2] + 0.1, abs=1e-6)
 
 
 def test_an_evaluation_starts_all_worlds_in_the_default_pose(env):

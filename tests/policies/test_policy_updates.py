@@ -37,16 +37,18 @@ def small_policy(num_obs=24):
 
 
 class RenameFault:
-    """Replacement of os.replace that raises an exception instead of rename number `stop`, from 0."""
+    """Replacement of os.replace that raises an exception instead of rename number `stop`, from 0, or after it."""
 
-    def __init__(self, stop, error):
-        self.stop, self.error, self.count, self.replace = stop, error, 0, os.replace
+    def __init__(self, stop, error, *, after=False):
+        self.stop, self.error, self.after, self.count, self.replace = stop, error, after, 0, os.replace
 
     def __call__(self, source, target):
         self.count += 1
-        if self.count == self.stop + 1:
+        stops = self.count == self.stop + 1
+        if self.after or not stops:
+            self.replace(source, target)
+        if stops:
             raise self.error
-        self.replace(source, target)
 
 
 @pytest.fixture
@@ -96,13 +98,15 @@ def test_two_writers_and_a_reader_of_a_policy_leave_it_loadable(folder):
         (folder / name).write_bytes(content)
 
 
+@pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("stop", range(6))  # of the renames to four files and of two folders
-def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monkeypatch, stop):
-    monkeypatch.setattr(os, "replace", RenameFault(stop, KeyboardInterrupt()))
+def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monkeypatch, stop, after):
+    monkeypatch.setattr(os, "replace", RenameFault(stop, KeyboardInterrupt(), after=after))
     with pytest.raises(KeyboardInterrupt):
         save_policy(folder, small_policy(), overwrite=True)
     Policy.load(folder)
-    assert (folder / "metrics.json").read_bytes() == OLD["metrics.json"]
+    kept = not (after and stop == 5)
+    assert (folder / "metrics.json").exists() is kept
     assert [path.name for path in folder.parent.iterdir()] == ["jump"]
 
 

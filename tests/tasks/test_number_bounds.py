@@ -5,11 +5,11 @@ import pytest
 
 from hold_height import hold_height, near_goal
 from jumper_warp.envs.skill import TaskRuntime
-from jumper_warp.kernels.jump import rewards
+from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
-from jumper_warp.tasks.terms import EventTerm, RewardTerm
+from jumper_warp.tasks.terms import EventTerm, RewardTerm, TerminationTerm
 from jumper_warp.utils.errors import InputError
 
 STEP_DT = 1.0 / 60.0
@@ -52,10 +52,20 @@ def test_a_parameter_has_the_same_bounds_in_a_term_and_while_an_environment_runs
         term.with_flat_numbers((term.flat_numbers | {key: value}).values())
 
 
-@pytest.mark.parametrize(("func", "name"), [(rewards.soft_impact, "limit"), (rewards.landing_tilt, "angle")])
-def test_refuses_to_divide_by_zero_in_a_reward(func, name):
+SQUAT = {"takeoff_height": 0.3, "floor": 0.15}
+DIVISIONS = [
+    (rewards.soft_impact, "limit", {"weight": 1.0}),
+    (rewards.landing_tilt, "angle", {"weight": 1.0}),
+    (rewards.squat, "acceleration", {"weight": 1.0, "std": 0.03, **SQUAT}),
+    (terminations.shallow_squat, "acceleration", {"tolerance": 0.04, **SQUAT}),
+]
+
+
+@pytest.mark.parametrize(("func", "name", "numbers"), DIVISIONS)
+def test_refuses_to_divide_by_zero(func, name, numbers):
+    kind = RewardTerm if "weight" in numbers else TerminationTerm
     with pytest.raises(InputError, match=f"'{name}' must be a width"):
-        RewardTerm(func, 1.0, **{name: 0.0})
+        kind(func, **numbers, **{name: 0.0})
 
 
 def test_randomisation_at_the_ends_of_the_bounds_is_accepted():
