@@ -208,7 +208,7 @@ def test_training_samples_around_the_overlay_and_flags_replace_ranges(overlay_fi
 @pytest.mark.parametrize(
     ("settings", "latency", "friction"),
     [
-        ({"randomize": True}, (2, 3), (0.5, 0.6)),
+        ({"randomize": True}, (2, 3), (0.05, 0.6)),
         ({"randomize": True, "latency": 10.0, "friction": 0.4}, (5, 5), (0.4, 0.4)),
         ({"latency": 10.0}, (5, 5), (0.6, 0.6)),
         ({"sensor_offset": 1.0}, (2, 2), (0.6, 0.6)),
