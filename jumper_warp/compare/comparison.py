@@ -161,7 +161,9 @@ def compare(
         names = ", ".join(arm.name for arm in arms)
         raise InputError(f"a comparison needs two arms, got {names}; name them: NAME=RUN OTHER=RUN")
     if metric and not any(len(arm.last(metric)) for arm in arms):
-        raise InputError(f"no run has logged {metric}; {arms[0].name} has logged {', '.join(arms[0].members[0].last)}")
+        raise InputError(
+            f"no run has logged {metric}; {arms[0].name} has logged {', '.join(arms[0].members[0].last) or 'nothing'}"
+        )
     conditions = conditions or Conditions()
     configure_device(conditions.device, conditions.threads)
     evaluated: list[Values] = [{} for _ in arms]

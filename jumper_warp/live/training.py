@@ -10,6 +10,7 @@ from jumper_warp.live.clips import SHOWN_RUNS
 from jumper_warp.live.feed import Feed, Setup, Steps, Viewer
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.rl.run_names import title
+from jumper_warp.utils.checks import check_not_negative
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +23,11 @@ class TrainingWatch:
     """Observer of one training, or of several seeds side by side; see `jumper_warp.rl.runner.Observer`."""
 
     def __init__(self, viewer: Viewer = "rerun", video_every: int = 0) -> None:
-        """Prepare to show a training; video_every: iterations between two films, 0: none."""
+        """Prepare to show a training; video_every: iterations between two films, 0: none.
+
+        Raises InputError: video_every is below 0.
+        """
+        check_not_negative("video_every", video_every)
         self._viewer = viewer
         self._video_every = video_every
         self.feed: Feed | None = None

@@ -172,6 +172,8 @@ def test_a_missing_metric_is_refused_with_the_logged_ones(runs):
         _ = compared(runs, "base", "tuck", primary="Metrics/sucess").primary
     with pytest.raises(InputError, match="no run has logged Metrics/sucess; base has logged iteration"):
         compared(runs, "base", "tuck", metric="Metrics/sucess")
+    with pytest.raises(InputError, match="vertical_jump has logged nothing"):
+        compare("vertical_jump", runs / "base", metric="Metrics/sucess")
 
 
 def test_the_steps_to_a_share_can_be_the_primary_metric(runs):

@@ -15,6 +15,7 @@ from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.training import train
+from jumper_warp.utils.errors import InputError
 from live_helpers import STEPS, short_training
 from toy_task import equal
 
@@ -137,6 +138,11 @@ def test_player_drops_an_episode_with_lost_steps():
     player.skip()
     player.add(rows(0, [0, 0], [7, 8]))
     assert shown(player, 4) == [1, 2, 1, 2]
+
+
+def test_a_negative_number_of_iterations_between_films_is_refused():
+    with pytest.raises(InputError, match="video_every"):
+        TrainingWatch("none", video_every=-1)
 
 
 class KilledWatch(TrainingWatch):
