@@ -11,7 +11,7 @@ from contextlib import suppress
 import can
 
 from jumper_warp.bench.bus_sim import BusSim
-from jumper_warp.deploy.realtime import request_real_time, uncollected
+from jumper_warp.deploy.realtime import real_time, uncollected
 
 WIRE_TIME = 1.2e-4  # [s] of a frame of 8 bytes at 1 Mbit/s
 SHIFT = 5.0e-5  # [s] Largest shift of a physics step toward the middle between the runtime's ticks
@@ -23,7 +23,6 @@ def serve_in_real_time(far: BusSim, seconds: float, latency: float) -> None:
     A frame occupies its bus for WIRE_TIME. latency: of a motor's reply [s]. Motors reply with the state of the last
     physics step; the steps take place between the runtime's ticks, so that no reply waits for one.
     """
-    request_real_time()
     events: list[tuple[float, int, int, int, can.Message, bool]] = []  # time, id, order, bus, frame, whether it is sent
     order = itertools.count()
     free = [0.0] * len(far.buses)  # time from which each bus is free
@@ -34,7 +33,7 @@ def serve_in_real_time(far: BusSim, seconds: float, latency: float) -> None:
         """Add a frame that is ready, or has passed its bus, at a time; of several frames the lowest id comes first."""
         heapq.heappush(events, (at, message.arbitration_id, next(order), number, message, sent))
 
-    with uncollected():
+    with real_time(), uncollected():
         while due - start < seconds:
             now = time.monotonic()
             while events and events[0][0] <= now:

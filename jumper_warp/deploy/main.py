@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import Log, replay
 from jumper_warp.deploy.operator import HELP, NOTHING, Keyboard, raw_terminal
-from jumper_warp.deploy.realtime import request_real_time, run_loop
+from jumper_warp.deploy.realtime import real_time, run_loop
 from jumper_warp.deploy.runtime import RATES, Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.deploy.watchdog import Watchdog
@@ -109,13 +110,14 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
             last = (runtime.state, runtime.reason)
             print(f"{runtime.state.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
 
+    until_stopped = ExitStack()  # also for the ticks that brake
     try:
         with raw_terminal():
             if options.lockstep:
                 for _ in itertools.takewhile(lambda number: number < options.seconds * rate, itertools.count()):
                     tick(0.0)
             else:
-                request_real_time()
+                until_stopped.enter_context(real_time())
                 result = run_loop(tick, rate, options.seconds)
                 print(json.dumps(result | {"replies_lost": 1.0 - replies / (12 * result["ticks"])}))
     except KeyboardInterrupt:
@@ -123,6 +125,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
     finally:
         for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
             runtime.tick(request)
+        until_stopped.close()
         if dog is not None:
             dog.close()
         link.close()

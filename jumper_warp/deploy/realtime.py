@@ -17,13 +17,24 @@ SPIN = 1.0e-4  # [s] before each tick without sleeping; a loop without sleep wou
 PRIORITY = 80  # of SCHED_FIFO
 
 
-def request_real_time() -> None:
-    """Give the process the real-time priority PRIORITY and keep its memory in place, or print a warning."""
-    ctypes.CDLL(None).mlockall(3)  # present and future pages
+@contextmanager
+def real_time() -> Iterator[None]:
+    """Give the process the priority PRIORITY of SCHED_FIFO in a block and keep its memory in place, or print a warning.
+
+    Afterwards the process has its former priority, and none of its memory is locked.
+    """
+    libc = ctypes.CDLL(None)
+    former = os.sched_getscheduler(0), os.sched_getparam(0)
+    libc.mlockall(3)  # present and future pages
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    except (PermissionError, AttributeError) as error:
+    except PermissionError as error:
         print(f"no real-time priority ({error}): ticks will be late; run with CAP_SYS_NICE", file=sys.stderr)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *former)
+        libc.munlockall()
 
 
 def run_loop(tick: Callable[[float], object], rate: int, seconds: float) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 import errno
 import json
+import os
 import shutil
 import socket
 import threading
+from pathlib import Path
 
 import can
 import numpy as np
@@ -231,6 +233,24 @@ def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
 def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
     with pytest.raises(InputError, match=flag[0].strip("-")):
         bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])
+
+
+def process_state():
+    """Return the scheduling policy of this process, and the line about its locked memory."""
+    status = Path("/proc/self/status").read_text().splitlines()
+    return os.sched_getscheduler(0), next(line for line in status if line.startswith("VmLck"))
+
+
+@pytest.mark.parametrize("end", ["runtime", "robot"])
+def test_process_has_neither_real_time_priority_nor_locked_memory_afterwards(end, bundle_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    before = process_state()
+    flags = ["--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"]
+    if end == "runtime":
+        main.main([str(bundle_folder), *flags])
+    else:
+        bus_sim(flags)
+    assert process_state() == before
 
 
 def test_closed_standard_input_is_no_terminal(bundle_folder, tmp_path, monkeypatch, capsys):
