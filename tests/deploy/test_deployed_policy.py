@@ -28,7 +28,7 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorials" / "on_a_robot.md"
-COMMAND_STEP, HEIGHT = 30, 0.95  # policy step of the command to jump; commanded base height [m]
+COMMAND_STEP, HEIGHT = 30, 0.9  # policy step of the command to jump; commanded base height [m]
 
 
 def without_history(policy, readings):
@@ -38,10 +38,10 @@ def without_history(policy, readings):
 
 
 MISTAKES = {
-    "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.748),
+    "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.685),
     "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.395),
-    "no history": (without_history, 0.785),
-    "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.805),
+    "no history": (without_history, 0.763),
+    "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.823),
 }
 """Mistakes of a deployment program by name: a function that makes it, and the apex [m]."""
 
@@ -85,9 +85,22 @@ def simulated_robot(lateral_torque):
     return Simulation(1, motors=motors, friction=0.85, device="cpu")
 
 
-def test_jump_to_a_height_reaches_it():
+@pytest.fixture(scope="module")
+def environment_apex():
+    """Apex [m] of the policy's jump to HEIGHT in the environment."""
+    policy = load_policy("vertical_jump")
+    env = env_of_recipe(policy.recipe(), 1, Conditions(device="cpu"))
+    env.evaluation_reset([[0.0, 0.0, HEIGHT, COMMAND_STEP]])
+    heights = []
+    for _ in range(120):
+        env.step(policy.act(env.obs))
+        heights.append(env.sim.joint_q()[0, Z])
+    return max(heights)
+
+
+def test_jump_to_a_height_is_that_of_the_environment(environment_apex):
     apex, _ = jump()
-    assert apex == pytest.approx(HEIGHT, abs=0.004)  # [m]; 0.9510
+    assert apex == pytest.approx(environment_apex, abs=0.004)  # [m]; 0.911
 
 
 def test_jump_to_a_place_ends_there():
@@ -176,9 +189,9 @@ def test_mistakes_change_the_apex(mistake):
     assert apex == pytest.approx(known, abs=0.02)  # [m]
 
 
-def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff():
+def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(environment_apex):
     apex, takeoffs = jump(delay=9, ticks=480)  # policy steps of 1/60 s
-    assert apex == pytest.approx(HEIGHT, abs=0.005) and takeoffs == 1
+    assert apex == pytest.approx(environment_apex, abs=0.005) and takeoffs == 1
 
 
 @pytest.mark.parametrize(("delay", "least"), [(18, 2), (480, 6)])  # takeoffs; 7 without end
