@@ -62,7 +62,7 @@ def vertical_jump_standing() -> TaskCfg:
             TerminationTerm(terminations.turned_touchdown, rotation=25.0 * DEG, yaw=15.0 * DEG),
         ),
         levels=heights((0.45, 0.70), (0.45, 0.95), (0.45, 1.15)),
-        randomization=replace(FRICTION, zero_latency_probability=0.1),
+        randomization=replace(FRICTION, latency=(0.0, 18.0), zero_latency_probability=0.1),
         evaluation=HeightEvaluation(hold=HOLD),
     )
     task = task.with_terms("terminations", moved_away={"distance": 0.25})
