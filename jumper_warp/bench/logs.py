@@ -65,7 +65,10 @@ class LogCfg:
 
 
 def simulated_again(ticks: np.ndarray, rate: int) -> np.ndarray:
-    """Return the joint coordinates (ticks, 43) of a simulation that gets a log's commands from its first pose on."""
+    """Return the joint coordinates (ticks, 43) of a simulation that gets a log's commands, from its first pose on.
+
+    It starts at rest. rate: ticks per second. A row is the state in which a tick's commands arrive.
+    """
     far = BusSim([], sim=make_simulation(1.0 / rate))
     q = far.sim.joint_q()[0].copy()
     q[:3], q[3:7], q[MOTORS] = ticks["position"][0], ticks["quaternion"][0], ticks["angle"][0]

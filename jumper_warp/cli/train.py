@@ -216,7 +216,10 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
 
 def watches(args: Sequence[str]) -> list[TrainingWatch]:
-    """Return the observers that the flags --watch and --video-every in unparsed arguments ask for."""
+    """Return the observers that the flags --watch and --video-every in unparsed arguments ask for.
+
+    `parse_train` returns a recipe, and a recipe holds nothing about terminals and viewers.
+    """
     watched = "--watch" in args
     every = int((values_of("--video-every", args) or ["0"])[-1])
     if not watched and every < 1:

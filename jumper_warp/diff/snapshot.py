@@ -43,7 +43,7 @@ def compact_columns(joint_values: torch.Tensor, base: int) -> torch.Tensor:
     """Return the values of the base and the 12 motors from Newton's joint coordinates or rates.
 
     joint_values: (num_worlds, columns). Returned: (base + 12, num_worlds). base: number of base columns, 7 coordinates
-    or 6 rates; 20 columns of leg joints follow.
+    or 6 rates; five joints of each leg follow: lateral, outer, outer knee, inner, inner knee. Knees have no motors.
     """
     legs = joint_values[:, base : base + 20].unflatten(1, (4, 5))
     motors = torch.cat([legs[..., :2], legs[..., 3:4]], -1).flatten(1)

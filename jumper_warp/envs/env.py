@@ -23,7 +23,7 @@ from jumper_warp.envs.arrays import (
     checked_worlds,
 )
 from jumper_warp.envs.gradients import EnvGradients
-from jumper_warp.envs.stages import Stages, WorldSlice, usual_kernels
+from jumper_warp.envs.stages import STAGES, Stages, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
@@ -31,7 +31,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay, robots_of
-from jumper_warp.sim.dynamics import WorldRange, advance_kernel
+from jumper_warp.sim.dynamics import advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
 from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg, checked_tasks
 from jumper_warp.tasks.interface import interface
@@ -49,8 +49,6 @@ from jumper_warp.utils.threads import WARP_LOCK, locked
 Values = ArrayLike | torch.Tensor  # Numbers, lists, arrays or tensors
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
-
-STAGES = ("action", "physics", "episode", "observe", "reset")  # of a policy step, in order; see `Env.stages`
 
 
 class Step(NamedTuple):
@@ -308,33 +306,6 @@ class Env(Stages):
         with WARP_LOCK:
             launch()  # loads the modules; counts as this step
             self._graphs[kind] = SlicedGraph(launch, self.sim.slices, self.wp_device)
-
-    def _launch_step(self, worlds: WorldRange | None = None, names: Sequence[str] = STAGES) -> None:
-        """Launch stages of a policy step, by default all, for a range of worlds (default: all)."""
-        stages = self.stages(worlds)
-        for name in names:
-            stages[name]()
-
-    def _advance_physics(self, part: WorldSlice) -> None:
-        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
-        delays = self.delays
-        self.sim.advance(
-            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
-            worlds=WorldRange(part.first, part.count),
-        )  # fmt: skip
-        self._track(part)
-
-    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
-        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
-
-        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range. Raises
-        InputError (a ValueError): a range beyond the worlds.
-        """
-        part = self._part(worlds)
-        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance_physics(part),
-                "episode": lambda: self._compute_rewards_and_dones(part),
-                "observe": lambda: self._observe(part, after_reset=0),
-                "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     # ------------------------------------------------------------------ settings, commands and hand-overs
 

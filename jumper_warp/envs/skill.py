@@ -35,7 +35,9 @@ class TaskRuntime:
     """Kernels and arrays of one task in an environment; attributes that are structs or arrays are kernel arguments.
 
     kernels: see `kernels_of`. params: numbers of the terms; `params.values` is the kernels' argument `p`. obs,
-    final_obs: torch views (num_envs, columns) by group, after and before resets.
+    final_obs: torch views (num_envs, columns) by group, after and before resets. timer: policy steps until each event
+    happens, (events, num_envs). term_value: rewards of the last step, (rewards, num_envs); episode_sum: their sums over
+    the episode. counters: statistics of ended episodes since they were last read. levels: of the curriculum.
     """
 
     def __init__(

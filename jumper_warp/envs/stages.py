@@ -7,7 +7,7 @@ environment of several.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.kernels import Kernel, KernelStruct
 from jumper_warp.utils.streams import Purpose
 
+STAGES = ("action", "physics", "episode", "observe", "reset")  # of a policy step, in order; see `Env.stages`
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
 BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels by name, where other than BLOCK
 POSTPROCESS_BLOCK = 256
@@ -145,11 +146,38 @@ class Stages(Uncopied):
         env.slice = self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
         return WorldSlice(*worlds, env)
 
+    def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
+        """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
+
+        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range. Raises
+        InputError (a ValueError): a range beyond the worlds.
+        """
+        part = self._part(worlds)
+        return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance_physics(part),
+                "episode": lambda: self._compute_rewards_and_dones(part),
+                "observe": lambda: self._observe(part, after_reset=0),
+                "reset": lambda: self._reset_done(part)}  # fmt: skip
+
+    def _launch_step(self, worlds: WorldRange | None = None, names: Sequence[str] = STAGES) -> None:
+        """Launch stages of a policy step, by default all, for a range of worlds (default: all)."""
+        stages = self.stages(worlds)
+        for name in names:
+            stages[name]()
+
     def _apply_actions(self, part: WorldSlice) -> None:
         """Convert actions to motor targets and wrenches, then run interval events."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
+
+    def _advance_physics(self, part: WorldSlice) -> None:
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
+        delays = self.delays
+        self.sim.advance(
+            self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
+            worlds=WorldRange(part.first, part.count),
+        )  # fmt: skip
+        self._track(part)
 
     def _track(self, part: WorldSlice) -> None:
         """Update paw kinematics, contacts and collisions after the physics of a policy step."""

@@ -105,7 +105,10 @@ class AgentLog(EvaluationLog):
         return {}
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return the base's height; recordings have the reward terms of their first robot."""
+        """Return the base's present height [m], (num_envs,); {} stands for a robot's name.
+
+        The recorder adds the reward terms of the first robot.
+        """
         return {"height/base, {} [m]": self.arrays["base_pos"][:, 2]}
 
 

@@ -52,7 +52,7 @@ class AttitudeLog(EvaluationLog):
     spacing = 1.5
 
     def __post_init__(self) -> None:
-        """Allocate an outcome per world, before the first policy step."""
+        """Check `turns`, and allocate an outcome per world. Raises InputError: they are no real numbers."""
         self.turns, self.count = real_array(self.turns, "turns", float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment

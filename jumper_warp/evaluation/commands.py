@@ -188,6 +188,8 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 def record(run: EvaluationRun, cfg: PlayCfg, live: Live | None = None) -> tuple[EvaluationLog, Recording]:
     """Simulate a policy, and return the log and the recording of all its robots; live: viewer that shows them.
 
+    Without cfg.seconds the recording ends with the last episode. Predictive control plans with nominal robots, since it
+    does not know what was sampled.
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
     from jumper_warp.evaluation.log import run_evaluation

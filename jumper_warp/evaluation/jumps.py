@@ -229,7 +229,7 @@ class JumpLog(EvaluationLog):
         self.goal_world = np.full((*shape, 2), np.nan)  # [m] (..., 2) goal, world
         self.takeoff = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at takeoff, world
         self.touchdown = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at touchdown, world
-        self.rest_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position REST_TIME after touchdown, world
+        self.rest_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position when it should rest, world
         # [m] (..., 4, 2) from each paw's last contact before takeoff to its first contact after touchdown, world axes
         self.paw_shift = np.full((*shape, 4, 2), np.nan)
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump

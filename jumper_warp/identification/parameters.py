@@ -230,7 +230,10 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the friction parameters: Coulomb friction of 12 motors, knee damping, friction of the paws."""
+    """Return the friction parameters: Coulomb friction of 12 motors, knee damping, friction of the paws.
+
+    They are positive and known by their order of magnitude only: their priors are log-normal, with estimated widths.
+    """
     parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"

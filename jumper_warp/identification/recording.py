@@ -144,9 +144,10 @@ def measure(
 ) -> RecordedMotion:
     """Convert a simulated motion to the recording that sensors with offsets and noise would make of it.
 
-    Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion of world 0;
-    robots: its sensor offsets. rng: random numbers of the noise, None for no noise. noise: its standard deviations.
-    torque: whether motor torques are recorded.
+    Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion, with
+    arrays (rows, values, worlds), of which world 0 is measured. robots: its sensor offsets. rng: random numbers of the
+    noise, None for no noise. noise: its standard deviations; that of the orientation is of a rotation vector [rad],
+    world axes. torque: whether motor torques are recorded.
     """
     levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)

@@ -88,9 +88,9 @@ class Learner(ABC):
     def _capture(self, *, epochs: bool = True) -> None:
         """Prepare the parts of an iteration, as CUDA graphs where the settings ask for them; epochs: the update too."""
         graphs = self.env.device.type == "cuda" and self.cfg.graphs
-        self._roll = CapturedProcedure(partial(self.collector.roll, self.generator), graphs, self.generator)
-        self._batch = CapturedProcedure(self.batch, graphs, self.generator)
-        self._optimise = CapturedProcedure(self._run_epochs, graphs and epochs)
+        self._roll_graph = CapturedProcedure(partial(self.collector.roll, self.generator), graphs, self.generator)
+        self._batch_graph = CapturedProcedure(self.batch, graphs, self.generator)
+        self._epochs_graph = CapturedProcedure(self._run_epochs, graphs and epochs)
 
     @abstractmethod
     def batch(self) -> Batch:
@@ -127,12 +127,12 @@ class Learner(ABC):
 
     def collect(self) -> None:
         """Run the current policy in the environment for one rollout, and store all transitions in `rollout`."""
-        self._roll()
+        self._roll_graph()
 
     def update(self) -> None:
         """Optimise the networks on the rollout for all epochs."""
-        self._batch()
-        self._optimise()
+        self._batch_graph()
+        self._epochs_graph()
 
     def order(self) -> torch.Tensor:
         """Return a random permutation of the batch's samples, (batch_size,) int64."""
@@ -194,5 +194,5 @@ class Learner(ABC):
 
     def close(self) -> None:
         """Delete all CUDA graphs; required before the process group is destroyed."""
-        for graph in (self._roll, self._batch, self._optimise):
+        for graph in (self._roll_graph, self._batch_graph, self._epochs_graph):
             graph.close()

@@ -210,7 +210,11 @@ SIZES = {"rotor_inertia": 1, "com": 3, "inertia": 6, "shell": 3, "hip": 3, "stop
 
 
 def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
-    """Return the values in a section of a table, by quantity; units: of all its quantities. Raises InputError."""
+    """Return the values in a section of a table, by quantity, in the table's units (degrees, rpm).
+
+    units: of all quantities in the section. Several numbers become an array, the name of a motor stays text. where:
+    the section's name, for messages. Raises InputError: a value is missing, or of another kind or unit.
+    """
     if not isinstance(section, dict):
         raise InputError(f"section {where!r} is missing: {ELSEWHERE}")
     if unknown := set(section) - set(units):

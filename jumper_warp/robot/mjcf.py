@@ -169,7 +169,10 @@ def _add_tendons(root: Element, robot: RobotDescription, values: RobotValues) ->
 
 
 def _add_actuators(root: Element, robot: RobotDescription) -> None:
-    """Add a position servo with jumping gains and torque limit for each motor, and the knees' capped dampers."""
+    """Add a position servo with gains and torque limit for each motor, and the knees' capped dampers.
+
+    MJCF holds one set of gains: those of jumps.
+    """
     actuators = add(root, "actuator")
     for name, motor in zip(MOTOR_JOINTS, robot.motors, strict=True):
         limit = robot.joint(name).effort

@@ -234,10 +234,10 @@ class JumperDynamics:
         )  # fmt: skip
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Read masses, joints and friction that were changed in the model.
+        """Read parameters that were changed in the model.
 
-        mask: (num_worlds,) float, not 0 in changed worlds; None: all worlds, and gravity and springs too. worlds: range
-        in which the mask is read, by default all.
+        mask: (num_worlds,) float, not 0 in worlds whose masses, armature or friction changed, all that a randomisation
+        changes; None: all parameters of all worlds. worlds: range in which the mask is read, by default all.
         """
         if mask is None:
             self.pack()
@@ -322,7 +322,10 @@ class JumperDynamics:
             self.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
     def step_kernels(self) -> list[tuple[Kernel, int]]:
-        """Return the kernels that `follow` launches without bodies, each with its number of threads per block."""
+        """Return the kernels that `follow` launches without bodies, each with its number of threads per block.
+
+        `Env` compiles them before the first step.
+        """
         momentum = self.modules.momentum
         projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [advance_kernel(self.device, self.modules), *(projection if self._momenta is not None else [])]

@@ -60,7 +60,7 @@ class LegDynamics:
 
 @wp.struct
 class PawKinematics:
-    """Position and Jacobians of the paw centre (the ankle), body axes."""
+    """Position and Jacobians of the centre of the paw, `paw_offset` from the ankle along the inner shank, body axes."""
 
     position: vec3  # [m] from the base origin
     jacobian: mat33  # [m/rad] d position / d (lateral, outer, inner)
@@ -86,7 +86,10 @@ def columns(a: vec3, b: vec3, c: vec3) -> mat33:
 
 @wp.func
 def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
-    """Return the position and Jacobians of a leg's paw centre in body axes."""
+    """Return the position and Jacobians of the centre of a leg's paw in body axes.
+
+    The paw is part of the inner shank and turns with it.
+    """
     loop, cosine, sine = pose.loop, pose.cosine, pose.sine
     zero = real(0.0)
     y = geo.plane_y + geo.knee_y

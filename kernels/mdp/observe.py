@@ -194,7 +194,10 @@ class StepContext:
 
 @wp.func
 def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
-    """Return the values of a world that all its observations share in a policy step: random key, flags, delay."""
+    """Return the values of a world that all its observations share in a policy step: random key, flags, delay.
+
+    The latency is below RING policy steps, and `step_count` starts above, so that no slot is negative.
+    """
     step_count = episode.step_count[world]
     steps = arrays.latency[world] // arrays.substeps
     m = StepContext()

@@ -88,8 +88,8 @@ class FusedCollector:
             torch.zeros(steps, worlds, env.num_actions, device=device), torch.zeros(env.num_actions, device=device),
             reward, done, timeout,
         )  # fmt: skip
-        self.obs = ObservationWriter(model.obs_moments, self.rollout.features, steps)
-        self.critic_obs = ObservationWriter(model.critic_moments, critic_features, steps)
+        self.obs_writer = ObservationWriter(model.obs_moments, self.rollout.features, steps)
+        self.critic_obs_writer = ObservationWriter(model.critic_moments, critic_features, steps)
         counts = {"dtype": torch.float64, "device": device}  # float32 counts to 2^24 only
         self.episode, self.finished = (torch.zeros(n, worlds, **counts) for n in (2, 3))  # as in `Collector`
 
@@ -99,8 +99,8 @@ class FusedCollector:
 
         generator: of the exploration noise (default: torch's).
         """
-        self.obs.begin()
-        self.critic_obs.begin()
+        self.obs_writer.begin()
+        self.critic_obs_writer.begin()
         self._fused.copy_weights()
         self.rollout.log_std.copy_(self._log_std)
         self.rollout.action.normal_(generator=generator)
@@ -108,13 +108,13 @@ class FusedCollector:
             self.act(step)
             self.env.step(self.rollout.action[step])
             self.record(step)
-        self.critic_obs.write(self._critic_obs, self.rollout.critic_features[-1])
+        self.critic_obs_writer.write(self._critic_obs, self.rollout.critic_features[-1])
 
     def act(self, step: int) -> None:
         """Sample actions for the current observations, and store both as policy step `step` of the rollout."""
         rollout, fused, worlds = self.rollout, self._fused, self.env.num_envs
-        self.obs.write(self.env.obs, rollout.features[step], step)
-        self.critic_obs.write(self._critic_obs, rollout.critic_features[step], step)
+        self.obs_writer.write(self.env.obs, rollout.features[step], step)
+        self.critic_obs_writer.write(self._critic_obs, rollout.critic_features[step], step)
         output = fused.actor.forward(rollout.features[step], worlds)
         launch(kernels.sample_action, (blocks(worlds, ROWS),))(
             output, fused.mirror, self._log_std, rollout.action[step], rollout.samples[step], worlds,
@@ -127,7 +127,7 @@ class FusedCollector:
         The final observation is the last one of an episode that has ended, which the critic needs at a timeout.
         """
         env, rollout, worlds = self.env, self.rollout, self.env.num_envs
-        self.critic_obs.write(self._final_critic_obs, rollout.final_features[step])
+        self.critic_obs_writer.write(self._final_critic_obs, rollout.final_features[step])
         launch(kernels.record_step, (blocks(worlds, ROWS),))(
             env.reward, env.done, env.timeout, rollout.reward[step], rollout.done[step], rollout.timeout[step],
             self.episode, self.finished, worlds, self.cfg.reward_scale, ROWS,

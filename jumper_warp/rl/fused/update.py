@@ -67,7 +67,7 @@ class FusedUpdate:
         reward = rollout.reward + cfg.gamma * rollout.timeout * scaling.denormalise(final_head)
         value = scaling.denormalise(head)
         advantage, target = (x.flatten() for x in gae(reward, rollout.done, value, cfg.gamma, cfg.lam))
-        obs, critic_obs = self._collector.obs.moments(), self._collector.critic_obs.moments()
+        obs, critic_obs = self._collector.obs_writer.moments(), self._collector.critic_obs_writer.moments()
         local = RolloutMoments(Moments.from_samples(advantage), Moments.from_samples(target), obs, critic_obs)
         advantage_scaling = update_statistics(model, local, self._obs_mirror, cfg)
         normalised = (advantage_scaling.normalise(advantage), model.value_moments.scaling().normalise(target))

@@ -91,7 +91,7 @@ RESET = ResetCfg(
 def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_JUMP_PROBABILITY) -> Level:
     """Return a curriculum level with goals x = (lower, upper) [m] ahead and up to y [m] to either side.
 
-    Standing starts are those of `STARTS[0]`.
+    Standing starts are those of `STARTS[0]`, until `cross_levels` replaces them.
     """
     return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], next_jump_probability)
 

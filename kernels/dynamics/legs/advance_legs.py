@@ -11,6 +11,8 @@ Motors of a leg are lateral, outer, inner. A hard stop limits a motor's angle, o
 stops change a leg's inertia, so that a step must assume a set of them before it is solved. `pressed` is such a set, one
 int of two bits per angle, 0: none. `sum_*`, `max_legs`, `first_leg`, `from_leg` exchange values among the four threads
 of a world, `any_world` among those of a warp; all threads must call them together.
+
+Velocities `lin` and `ang` of the base are in its axes at the start of a step, forces and moments on it in world axes.
 """
 
 import warp as wp
@@ -259,7 +261,7 @@ def advance_leg(
     total = sum_vec(solved.impulse)
     sets = old.sets + 1
     required = required_stops(model, settings, world, leg, old.angles, rates, pressed, sets)
-    first = first_leg(required != pressed)
+    first = first_leg(required != pressed)  # that needs another set; if none does, any leg
     agreed = from_leg(wp.where(required != pressed, real(1.0), real(0.0)), first) == real(0.0)
     done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
     if blocks:
