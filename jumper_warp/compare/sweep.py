@@ -59,6 +59,8 @@ class Sweep:
 
     def __post_init__(self) -> None:
         """Raise InputError: a field is of another type or out of range, or a flag is one that the sweep sets."""
+        if self.log_root == "":
+            raise InputError("sweep: log_root is empty")
         object.__setattr__(self, "log_root", Path(self.log_root))
         check_types("sweep:", self)
         check_count("sweep: number of seeds", len(self.seeds))

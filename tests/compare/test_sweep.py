@@ -185,6 +185,8 @@ def test_importances_find_the_parameter_that_matters():
 def test_wrong_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="a sweep needs parameters"):
         Sweep("a", "vertical-jump", {})
+    with pytest.raises(InputError, match="log_root is empty"):
+        Sweep("a", "vertical-jump", {"ppo.lr": {"low": 1.0, "high": 2.0}}, log_root="")
     sweep = Sweep("a", "vertical-jump", {"ppo.lr": {"low": 1.0}})
     with pytest.raises(InputError, match=r"parameter ppo\.lr"):
         sweep.distributions()
