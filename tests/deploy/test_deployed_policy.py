@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,12 @@ def without_history(policy, readings):
 
 
 MISTAKES = {
-    "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.685),
-    "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.395),
-    "no history": (without_history, 0.763),
-    "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.823),
+    "no default pose": lambda policy, r: r | {"angle": r["angle"] + policy.default},
+    "default pose twice": lambda policy, r: r | {"angle": r["angle"] - policy.default},
+    "no history": without_history,
+    "gravity upward": lambda policy, r: r | {"gravity": -r["gravity"]},
 }
-"""Mistakes of a deployment program by name: a function that makes it, and the apex [m]."""
+"""Mistakes of a deployment program by name: a function that makes it."""
 
 
 def onnx_of(name):
@@ -183,10 +184,11 @@ def jump(change=None, delay=0, ticks=180):
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_change_the_apex(mistake):
-    change, known = MISTAKES[mistake]
-    apex, _ = jump(change)
-    assert apex == pytest.approx(known, abs=0.02)  # [m]
+def test_mistakes_are_refused_or_change_the_apex(mistake, environment_apex):
+    apex = 0.0
+    with suppress(InputError):  # a reading out of range
+        apex, _ = jump(MISTAKES[mistake])
+    assert abs(apex - environment_apex) > 0.1  # [m]; a right program is within 0.005 m
 
 
 def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(environment_apex):
