@@ -11,13 +11,11 @@ longest flight, walking from half a second on.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jumper_warp.deploy.estimator import GRAVITY, IDENTITY, Estimator, quaternion_of, skew
-from jumper_warp.deploy.kinematics import legs
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.sim.simulation import motor_values
@@ -43,7 +41,6 @@ class Args(EvaluationArgs):
     joint_offset: float = 0.3  # [deg] Standard deviation of the offset of each joint angle
     seconds: float = 3.2  # [s] Simulated time
     wait: float = 1.5  # [s] Time before a jump is commanded
-    save: Path | None = None  # npz file for estimator_gtsam.py
 
 
 def matrix_of(quaternion: np.ndarray) -> np.ndarray:
@@ -154,22 +151,6 @@ def errors(true: dict[str, np.ndarray], data: dict[str, np.ndarray], args: Args)
     return {name: np.array(values) for name, values in found.items()}
 
 
-def save(
-    path: Path, true: dict[str, np.ndarray], data: dict[str, np.ndarray], found: dict[str, np.ndarray],
-    rows: np.ndarray, columns: np.ndarray, args: Args,
-) -> None:  # fmt: skip
-    """Write readings, true states, our errors and the compared ticks and robots to an npz file."""
-    estimator = Estimator()
-    estimator.reset(*(data[name][REST - 96 : REST].mean(0) for name in ("gyro", "accel", "q")))
-    arrays = {name: data[name][REST:] for name in ("gyro", "accel")}
-    arrays |= {f"true_{name}": true[name][REST + 1 :].repeat(args.num_draws, 1) for name in ("pos", "vel", "rot")}
-    arrays |= {"ankle": legs(data["q"][REST:])[0], "contact": found["contact"], "dt": true["dt"]}
-    arrays |= {"start_rot": estimator.rot, "start_pos": estimator.pos, "start_gyro": estimator.gyro_bias}
-    arrays |= {"ours": np.stack([found[name] for name in ("velocity", "height", "tilt")], axis=-1)}
-    arrays |= {"gyro_noise": np.array(estimator.cfg.gyro_noise), "accel_noise": np.array(estimator.cfg.accel_noise)}
-    np.savez(path, **arrays, rows=rows, columns=columns)  # type: ignore[arg-type]
-
-
 def landing(contact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the last tick of each motion's longest flight, and its ticks, (num_motions,); contact: (ticks, n, 4)."""
     length = np.zeros(contact.shape[1], dtype=int)
@@ -195,8 +176,6 @@ def main(args: Args) -> dict:
     rows, columns = (
         (last.repeat(args.num_draws), robots) if jumps else (g.ravel() for g in np.meshgrid(samples, robots))
     )
-    if args.save is not None:
-        save(args.save, true, data, found, rows, columns, args)
     metrics: Metrics = {"flight_max_s": MetricValue(ticks.max() * float(true["dt"]))}
     for name, unit in (("velocity", "m_s"), ("height", "m"), ("tilt", "deg")):
         values = np.abs(found[name][rows, columns])
