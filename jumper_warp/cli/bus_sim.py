@@ -8,7 +8,7 @@ from types import ModuleType
 
 from jumper_warp.bench.faults import BusFaults
 from jumper_warp.cli.main import parse
-from jumper_warp.utils.checks import check_count, check_not_negative, check_probabilities, check_seed
+from jumper_warp.utils.checks import check_count, check_not_negative, check_number, check_probabilities, check_seed
 
 
 @dataclass
@@ -39,6 +39,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     check_probabilities("bus-sim", cfg, "drop", "corrupt", "delay")
     for name in ("gyro_noise", "accel_noise", "seconds", "latency"):
         check_not_negative(name, getattr(cfg, name))
+    check_number("latency", cfg.latency, 0.0, 1000.0, "ms")
     far = BusSim(open_buses(cfg.bus, "robot"), cfg, sim=make_simulation(1.0 / cfg.rate, cfg.friction))
     print(f"bus-sim on {cfg.bus}", flush=True)
     try:

@@ -121,7 +121,7 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
     checkpoint = checkpoints[0]
     try:
         saved = recipe.from_json(parse_json(checkpoint.state["config"], "config"), defaults=recipe.train)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise CheckpointError(f"{checkpoint.path}: {error}") from error
     if saved.train.task != recipe.train.task:
         raise CheckpointError(f"{checkpoint.path}: of a run of {saved.train.task:.60}, not of {recipe.train.task}")
@@ -222,12 +222,12 @@ def watches(args: Sequence[str]) -> list[TrainingWatch]:
     """
     watched = "--watch" in args
     every = int((values_of("--video-every", args) or ["0"])[-1])
-    if not watched and every < 1:
+    if not watched and every == 0:
         return []
     from jumper_warp.live.training import TrainingWatch
 
     viewer: Any = (values_of("--viewer", args) or ["rerun"])[-1]
-    return [TrainingWatch(viewer if watched else "none", max(every, 0))]
+    return [TrainingWatch(viewer if watched else "none", every)]
 
 
 def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import yaml
 from jumper_warp.deploy.codec import Codec
 from jumper_warp.deploy.control import Gains, TorqueCurve
 from jumper_warp.deploy.policy import DeployedPolicy
+from jumper_warp.deploy.safety import Safety
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_file
 
@@ -37,13 +39,17 @@ class Bundle:
             self.settings: dict[str, Any] = yaml.safe_load(read_file(self.folder / FILE, "settings of a bundle"))
             if self.settings.get("version") != VERSION:
                 raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
+            check_numbers("", self.settings)
             self.joints = JointMap(self.settings)
+            Safety(self.settings["safety"], self.settings["closed_chain"]["transversal_sum"])
             self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
             self.hold = Gains.from_yaml(self.settings["hold"])
             self.default = np.array(self.settings["default_joint_pos"], dtype=np.float32)
             self.joints.frames(self.default, self.hold.kp, self.hold.kd)  # ValueError: of another size, or NaN
             self.joints.frames(self.default, self.hold.kp, np.array(self.settings["safety"]["damping"]))
             self.policies = {name: self._policy(fields) for name, fields in self.settings["policies"].items()}
+            if not self.policies:
+                raise InputError(f"{self.folder / FILE}: no policies")
             self.edited = settings_hash(self.settings) != self.settings.get("sha256")  # since the export
 
     @contextmanager
@@ -113,6 +119,15 @@ class JointMap:
         frames = np.empty((12, 8), np.uint8)
         frames[self.motor] = self._by_joint.encode(command)
         return frames
+
+
+def check_numbers(name: str, value: Any) -> None:
+    """Raise ValueError if a number in nested settings is not finite: a limit of NaN is never exceeded."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{name[1:]} is {value}")
+    entries = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, entry in entries:
+        check_numbers(f"{name}.{key}", entry)
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:

@@ -33,12 +33,17 @@ class Safety:
     """Checks of every tick."""
 
     def __init__(self, settings: Mapping[str, Any], transversal_sum: Sequence[float]) -> None:
-        """Read the section safety of deploy.yaml; transversal_sum: limits of outer + inner angle [deg]."""
+        """Read the section safety of deploy.yaml; transversal_sum: limits of outer + inner angle [deg].
+
+        Raises LookupError, TypeError or ValueError: a limit is missing, or of another type or size.
+        """
         names = ("torque_factor", "torque_margin", "max_temperature", "max_rate", "max_tilt", "max_late")
         self._limits = {name: float(settings[name]) for name in names}
         margin, (low, high) = np.radians(settings["position_margin"]), transversal_sum
         self._lower = np.radians([*settings["lower"], *4 * [low]]) - margin  # (16,) [rad] of joints, and of legs' sums
         self._upper = np.radians([*settings["upper"], *4 * [high]]) + margin
+        if self._lower.shape != (16,) or self._upper.shape != (16,):
+            raise ValueError("lower and upper of the section safety need 12 angles each")
         self._ages = np.zeros(13, int)  # ticks since the last frame of each motor and of the IMU
         self.fault = Fault.NONE
         self.ticks = 0  # for how long it has lasted

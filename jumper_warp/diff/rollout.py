@@ -30,7 +30,7 @@ from jumper_warp.robot.motors import (
 from jumper_warp.sim.dynamics import JumperDynamics, WorldRange, check_step, slices_of
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.utils.arrays import real_array
-from jumper_warp.utils.checks import check_count, check_flags, check_within
+from jumper_warp.utils.checks import check_count, check_flags, check_type, check_within
 from jumper_warp.utils.copying import Uncopied
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Kernel, KernelStruct
@@ -303,6 +303,7 @@ class Rollout(Uncopied):
         `parameters`, and `geometry` (4, 10, num_worlds) w.r.t. the legs' lengths. The gradient w.r.t. the initial
         quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
+        check_type("trajectory", trajectory, Trajectory)
         n = self.num_worlds
         modules = self.dynamics.modules
         commands = trajectory.commands

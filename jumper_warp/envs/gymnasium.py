@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
@@ -112,6 +113,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         Raises InputError (a ValueError): other options, no mask, or one of no world. gymnasium.error.Error: not a seed.
         """
         self._check_open()
+        check_type("options", options, Mapping | None)
         mask = self._checked_mask(dict(options or {}))
         super().reset(seed=seed)
         if seed is not None:

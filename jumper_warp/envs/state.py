@@ -12,6 +12,7 @@ import warp as wp
 from jumper_warp.kernels.mdp.env import Counters, Delays, EpisodeArrays
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotArrays
+from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import records
 from jumper_warp.utils.streams import purpose_seed
@@ -51,6 +52,9 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
     noise, refine or version.
     """
+    check_type("state", state, dict)
+    for name, value in state.items():
+        check_type(f"saved {name!s:.60}", value, torch.Tensor)
     tensors = _tensors(env)
     saved = {prefix: records(array).copy() for prefix, array in _records(env).items()}
     conditions = _conditions(env)

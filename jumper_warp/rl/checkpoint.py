@@ -172,6 +172,11 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, Json]:
     if missing_ok and not path.exists():
         return {}
     manifest = read_json(path, "checksums of checkpoints", error=CheckpointError, finite=False)  # scores may be NaN
-    if not isinstance(manifest, dict):
+    if not isinstance(manifest, dict) or not all(map(_is_entry, manifest.values())):
         raise CheckpointError(f"{path}: not readable")
     return manifest
+
+
+def _is_entry(entry: Any) -> bool:
+    """Return whether a value can be an entry of a manifest: an object with a checksum and a score."""
+    return isinstance(entry, dict) and "sha256" in entry and isinstance(entry.get("score", ""), float | int | None)

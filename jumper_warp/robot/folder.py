@@ -200,6 +200,9 @@ def robot_of(table: Json) -> RobotDescription:
         table=table,
     )
     make_read_only(robot)
+    for link in robot.links:
+        if np.linalg.eigvalsh(link.inertia)[0] <= 0.0:
+            raise InputError(f"{link.name}: the principal moments of its inertia must be positive")
     for leg in LEGS:
         leg_dimensions(robot, leg).depth(*robot.poses["default"])
     return robot
@@ -207,6 +210,7 @@ def robot_of(table: Json) -> RobotDescription:
 
 SIZES = {"rotor_inertia": 1, "com": 3, "inertia": 6, "shell": 3, "hip": 3, "stops": 2, "pose": 2}
 """Number of values of a quantity, by the end of its name; others have one."""
+POSITIVE = ("mass", "peak_torque", "no_load_speed", "gear_ratio")  # Ends of names of quantities that cannot be 0
 
 
 def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
@@ -235,11 +239,13 @@ def _values(where: str, section: Any, units: Mapping[str, str]) -> Json:
             numbers = [value] if size == 1 else value
             fits = isinstance(numbers, Sequence) and len(numbers) == size and all(map(is_finite, numbers))
             value = np.array(value, dtype=float) if fits and size > 1 else value
-        if not fits or (size == 1 and not isinstance(value, str) and value < 0.0):
-            wanted = "the name of a motor" if name.endswith("_motor") else f"{size} finite number{'s' * (size > 1)}"
-            raise InputError(
-                f"{where}: {name} must be {wanted}, not negative if a single one, got {row['value']!r:.60}"
-            )
+        if fits and size == 1 and not isinstance(value, str):
+            fits = value > 0.0 if name.endswith(POSITIVE) else value >= 0.0
+        if not fits:
+            sign = "positive" if name.endswith(POSITIVE) else "not negative if a single one"
+            numbers = f"{size} finite number{'s' * (size > 1)}, {sign}"
+            wanted = "the name of a motor" if name.endswith("_motor") else numbers
+            raise InputError(f"{where}: {name} must be {wanted}, got {row['value']!r:.60}")
         values[name] = value
     return values
 

@@ -116,9 +116,11 @@ def build_model(
 
 def described_robots(description: RobotDescription | Sequence[RobotDescription] | None) -> list[RobotDescription]:
     """Return the robots of an argument `description`, by default the project's own. Raises InputError."""
-    check_type("description", description, RobotDescription | Sequence | None)
-    if description is None or isinstance(description, RobotDescription):
-        return [load_description() if description is None else description]
+    check_type("description", description, RobotDescription | Sequence[RobotDescription] | None)
+    if isinstance(description, RobotDescription):
+        return [description]
+    if not description:
+        return [load_description()]
     robots = list(description)
     for name in ("poses", "transversal_sum", "knee_damping_limit", "knee_damping", "motors"):
         if any(getattr(robot, name) != getattr(robots[0], name) for robot in robots):

@@ -93,7 +93,8 @@ class RobotOverlay:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
         for name in ("values", "randomization"):  # arrays become tuples, which JSON can hold
             check_type(f"robot overlay: {name}", getattr(self, name), Mapping)
-            pairs = {key: tuple(np.asarray(row).tolist()) if np.ndim(row) == 1 else row
+            pairs = {key: tuple(row.tolist() if isinstance(row, np.ndarray) and row.ndim == 1 else row)
+                     if isinstance(row, np.ndarray | list) else row
                      for key, row in getattr(self, name).items()}  # fmt: skip
             object.__setattr__(self, name, pairs)
         check_types("robot overlay", self)

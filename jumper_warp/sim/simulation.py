@@ -418,8 +418,8 @@ def _values_of(
         if "paw_friction" not in one.values:
             values.paw_friction[:] = friction
         each.append(values)
-    if len(each) == 1:
-        return each[0]
+    if len(each) < 2:
+        return each[0] if each else None
     turns = np.arange(num_worlds) % len(each)
     return RobotValues(**{name: np.vstack([getattr(one, name) for one in each])[turns] for name in vars(each[0])})
 
@@ -428,7 +428,7 @@ def _descriptions_of(robot: RobotOverlay | Sequence[RobotOverlay] | RobotValues 
     """Return the descriptions of the robots that worlds take in turn."""
     if robot is None or isinstance(robot, RobotValues):
         return [load_description()]
-    return [one.description for one in robots_of(robot)]
+    return [one.description for one in robots_of(robot)] or [load_description()]
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:

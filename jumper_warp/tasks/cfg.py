@@ -99,7 +99,8 @@ class Command(Copyable):
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
         labelled = all(LABEL.fullmatch(label) for label in self.labels) and len(set(self.labels)) == len(self.labels)
-        if not labelled or not max(len(self.least), self.optional + 1) <= (len(self.labels) or 1) <= 4:
+        fits = self.optional >= 0 and max(len(self.least), self.optional + 1) <= (len(self.labels) or 1) <= 4
+        if not labelled or not fits:
             wanted = "1 to 4 distinct labels with units, as 'x [m]', the first not optional"
             raise InputError(f"a command has {wanted}, got {self.labels!r:.200}")
 

@@ -39,6 +39,8 @@ from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 SUFFIXES = (".mp4", ".webp", ".gif")
 DIRECTION = (0.62, -1.0, 0.28)  # from the robots to the camera, world frame: on their right, ahead, above
 MAX_FRAMES = 1800  # of WebP and GIF, which are encoded in memory
+MOST_FRAMES = 10**6  # of MP4
+SLOWEST = 0.01  # [1/s] Least frames per second; a frame of a GIF may last 655 s
 GIF_FPS = 50.0  # [1/s] largest frame rate of a GIF: players slow down images shorter than 20 ms
 TRAIL_SECONDS = 1.5  # [s] length of the trails of base and paws
 
@@ -68,9 +70,12 @@ def write_film(
     size = (width, height)
     check_film(path, size, fps, speed, eye)
     View(np.array([1.0, 0.0, 0.0]), np.zeros(3), field_of_view).axes()
+    count = int((recording.times[-1] - recording.times[0] + 1.0e-9) * fps / speed) + 1
+    most = MOST_FRAMES if path.suffix == ".mp4" else MAX_FRAMES
+    if count > most:
+        hint = "" if path.suffix == ".mp4" else "; use .mp4"
+        raise InputError(f"{path}: {path.suffix} may have up to {most} frames, got {count}{hint}")
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
-    if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
-        raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     check_type("ranks", ranks, Sequence[int])
     check_count("number of ranks", len(ranks))
@@ -99,8 +104,10 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye:
         raise InputError(f"{path}: the suffix of a film must be one of {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise InputError('MP4 films need imageio-ffmpeg: pip install "jumper-warp[video]"')
-    if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
-        raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
+    if not (64 <= min(size) and max(size) <= 7680 and SLOWEST <= fps <= 240.0 and 0.0 < speed <= 100.0):
+        raise InputError(
+            f"a film needs 64 to 7680 px, fps in [{SLOWEST}, 240], speed in (0, 100]; got {size}, {fps}, {speed}"
+        )
     if path.suffix == ".gif" and fps > GIF_FPS:
         raise InputError(f"{path}: a GIF may have up to {GIF_FPS:g} frames per second, got {fps:g}")
     if eye is not None:

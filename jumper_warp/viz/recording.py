@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.arrays import read_npz, write_npz
-from jumper_warp.utils.checks import check_type
+from jumper_warp.utils.checks import check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, parse_json
 from jumper_warp.viz.shapes import ShapeMesh, packed_shapes, unpacked_shapes
@@ -131,6 +131,7 @@ def load_npz(path: Path) -> Recording:
         if header["format"] != FORMAT or header["version"] != VERSION:
             raise RecordingError(f"expected a {FORMAT} of version {VERSION}")
         recording = _from_archive(header, archive)
+        check_types("recording", recording)
         _check_arrays(recording)
         return recording
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -179,5 +180,15 @@ def _check_arrays(recording: Recording) -> None:
         _check("motion", values.dtype.kind in "biuf" and values.shape[:2] == (frames, worlds))
     for values in recording.series.values():
         _check("series", values.dtype.kind in "fiu" and values.shape == (frames,))
+    for words in recording.states.values():
+        _check("states", len(words) == frames)
+    for shape in recording.shapes:
+        check_types(f"shape {shape.name!r:.40}", shape)
+        points, normals, triangles = shape.vertices, shape.normals, shape.triangles
+        _check("vertices", points.dtype.kind == "f" and points.shape[1:] == (3,) and np.isfinite(points).all())
+        _check("normals", normals.dtype.kind == "f" and normals.shape == points.shape)
+        _check("triangles", triangles.dtype.kind in "iu" and triangles.shape[1:] == (3,))
+        _check("triangles", not triangles.size or 0 <= triangles.min() <= triangles.max() < len(points))
+        _check("body of a shape", -1 <= shape.body < bodies)
     times = recording.times
     _check("times", frames > 0 and np.isfinite(times).all() and (np.diff(times) > 0.0).all())

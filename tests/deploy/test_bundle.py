@@ -1,6 +1,7 @@
 """Bundles: conformance vectors, ONNX metadata for other readers, and the runtime in a bare environment."""
 
 import importlib.metadata
+import math
 import os
 import shutil
 import subprocess
@@ -93,6 +94,27 @@ def test_mistake_in_the_settings_fails_the_check(change, bundle_folder, tmp_path
     bundle = Bundle(folder)
     assert check_bundle(bundle)
     assert bundle.edited
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "value", "message"),
+    [
+        ("safety", "max_rate", math.nan, "safety.max_rate is nan"),
+        ("safety", "max_tilt", math.inf, "safety.max_tilt is inf"),
+        ("safety", "upper", [*11 * [100.0], math.nan], "safety.upper.11 is nan"),
+        ("hold", "torque_limit", 12 * [math.nan], "hold.torque_limit.0 is nan"),
+        ("safety", "lower", 11 * [-50.0], "need 12 angles"),
+        ("safety", "upper", "", "need 12 angles"),
+        (None, "policies", {}, "no policies"),
+    ],
+)
+def test_limit_that_no_value_exceeds_is_refused(section, name, value, message, bundle_folder, tmp_path):
+    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+    settings = yaml.safe_load((folder / FILE).read_text())
+    (settings if section is None else settings[section])[name] = value
+    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+    with pytest.raises(InputError, match=message):
+        Bundle(folder)
 
 
 def test_stale_history_fails_the_check(bundle_folder, monkeypatch):

@@ -1,4 +1,5 @@
 import itertools
+import json
 import os
 import pickle
 
@@ -84,6 +85,15 @@ def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):
     with pytest.raises(CheckpointError, match=message) as caught:
         load_checkpoint(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("entry", [None, [], 3, {}, {"sha256": "", "score": []}])
+def test_refuses_a_manifest_with_other_entries(tmp_path, entry):
+    save_checkpoint(tmp_path, state(1))
+    (tmp_path / "manifest.json").write_text(json.dumps({"iteration_000001.pt": entry}))
+    for read in (best_checkpoint, latest_checkpoint):
+        with pytest.raises(CheckpointError, match=r"manifest\.json: not readable"):
+            read(tmp_path)
 
 
 class Payload:

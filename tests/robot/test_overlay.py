@@ -36,6 +36,8 @@ def test_load_overlay_inverts_save(tmp_path):
     [
         ({"values": {"colour": [1.0]}}, "unknown quantity 'colour'"),
         ({"values": {"kp": [1.0]}}, r"kp needs 12 values, got shape \(1,\)"),
+        ({"values": {"kp": [[1.0, 2.0], *11 * [1.0]]}}, "kp must be an array of numbers"),
+        ({"randomization": {"base_mass": [-0.1, []]}}, "base_mass must be an array of numbers"),
         ({"values": {"base_mass": [7000.0]}}, "base_mass must be in 0.001 to 100 kg"),
         (
             {"values": {"kp": 12 * [20.0]}},

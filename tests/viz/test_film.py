@@ -159,3 +159,17 @@ def test_interpolated_poses_are_unit_quaternions_halfway_and_exact_at_recorded_t
     turned = np.degrees(Rotation.from_quat(between[:, 0, 3:]).magnitude())
     assert turned == pytest.approx([20.0, 60.0, 125.0], abs=1e-3)
     assert between[:, 0, 0] == pytest.approx(np.array([0.5, 1.5, 2.5]) / 30.0)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "fps", "speed", "message"),
+    [
+        (".gif", 0.001, 1.0, "fps in"),
+        (".mp4", 30.0, 1.0e-9, "up to 1000000 frames"),
+        (".webp", 30.0, 1.0e-3, "use .mp4"),
+    ],
+)
+def test_film_with_too_slow_or_too_many_frames_is_refused(tmp_path, canvas, suffix, fps, speed, message):
+    with pytest.raises(InputError, match=message):
+        write_film(box_recording(walk(1.0)), tmp_path / f"film{suffix}", size=SIZE, fps=fps, speed=speed)
+    assert not canvas

@@ -1,5 +1,6 @@
 """Recordings: frames, NumPy archives and Rerun files, read back by Rerun's own reader."""
 
+import json
 from collections import defaultdict
 
 import newton
@@ -10,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from columns import X, Z
 from jumper_warp.viz.recorder import Recorder
-from jumper_warp.viz.recording import load_npz
+from jumper_warp.viz.recording import RecordingError, load_npz
 from jumper_warp.viz.rerun import write_rrd
 
 HEIGHT, TORQUE = "base/height [m]", "torque/FL_outer [N m]"  # series
@@ -94,6 +95,27 @@ def test_npz_restores_the_recording(model, tmp_path, suffix):
         assert (shape.name, shape.body, shape.color) == (original.name, original.body, original.color)
         np.testing.assert_array_equal(shape.vertices, original.vertices)
         np.testing.assert_array_equal(shape.triangles, original.triangles)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("shape0_triangles", lambda values: values + 1000),
+        ("shape0_vertices", lambda values: values * np.nan),
+        ("shape0_normals", lambda values: values[:1]),
+        ("shape0_triangles", lambda values: values.astype(str)),
+        ("header", lambda text: np.array(str(text).replace('"color": [', '"color": ["red", '))),
+        ("header", lambda text: np.array(json.dumps(json.loads(str(text)) | {"states": {"a": 3}}))),
+        ("header", lambda text: np.array(json.dumps(json.loads(str(text)) | {"states": {"a": ["x"]}}))),
+    ],
+)
+def test_npz_with_other_shapes_or_states_is_refused(model, tmp_path, name, damage):
+    path = record(model).recording().save_npz(tmp_path / "run.npz")
+    archive = dict(np.load(path))
+    assert damage(archive[name]) is not archive[name]
+    np.savez(path, **archive | {name: damage(archive[name])})
+    with pytest.raises(RecordingError, match=r"run\.npz: cannot be read as a recording"):
+        load_npz(path)
 
 
 def test_rrd_has_each_bodys_pose_in_each_frame(model, tmp_path):
