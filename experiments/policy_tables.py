@@ -133,7 +133,10 @@ def first_seed(policy: str) -> dict[str, Row]:
 
 
 def main_table(policy: str, task: TaskCfg) -> str:
-    """Return the main table of a policy: metrics as rows, conditions and published results as columns."""
+    """Return the main table of a policy: metrics as rows, conditions and published results as columns, and a note.
+
+    Published results on a robot share a column, separated by " / ".
+    """
     rows = first_seed(policy)
     paper = published(task)
     single = [(title, rows[name].metrics) for name, title in SHOWN.items() if name in rows]

@@ -90,7 +90,11 @@ class Bench:
         return runtime
 
     def over_bus(self, state: State, commands: np.ndarray, steps: int) -> dict[str, np.ndarray]:
-        """Run a skill with a command (3,) every `steps` policy steps, and return its trajectory by policy step."""
+        """Run a skill with a command every `steps` policy steps, and return its trajectory by policy step.
+
+        commands: (n, 3). Of walking: velocity ahead and to the left [m/s], yaw rate [rad/s]; of a jump up: height of
+        the apex [m]; of a jump to a place: ahead and to the left [m]. Unused components are 0.
+        """
         runtime = self.runtime()
         runtime._enter(state, commands[0])
         rows = []
@@ -133,7 +137,11 @@ class Bench:
         return np.array([0.0, 0.0, np.sin(half), np.cos(half)])
 
     def course(self, values: np.ndarray) -> bool:
-        """Run a course over the bus; values: height [m], place (2,) [m], speeds (2,). Return whether it succeeds."""
+        """Run a course over the bus, and return whether it succeeds.
+
+        There must be no fault, and each jump must end in walking within 12 s, with its apex or place within TOLERANCE.
+        values: height of the apex [m], place ahead and to the left of the base [m], two walking speeds [m/s].
+        """
         runtime = self.runtime()
         runtime._enter(State.WALK)
         for request, command in (

@@ -48,7 +48,7 @@ def places_of_paper(task: TaskCfg) -> TaskCfg:
 
 
 def places_of_sequel(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the Mars task with the goals of the authors' sequel, 1.4 to 4.75 m ahead.
+    """Return a copy of the Mars task with the goals of the authors' later paper on Mars, 1.4 to 4.75 m ahead.
 
     There are four goal ranges, each with the last two ranges of start heights of the task.
     """

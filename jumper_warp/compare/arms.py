@@ -73,7 +73,10 @@ class Member:
         return {name: float(value) for name, value in values.items() if value is not None}
 
     def curve(self, metric: str) -> np.ndarray:
-        """Return policy steps of all worlds, training time [s] and value of a metric, (3, logged iterations)."""
+        """Return policy steps of all worlds, training time [s] and value of a metric, (3, logged iterations).
+
+        It is of the whole log: `until` limits `last` alone.
+        """
         train = self.config["train"]
         steps = train["ppo"]["num_steps"] * train["num_envs"]
         logged = [line for line in self.log if line.get(metric) is not None]

@@ -215,5 +215,5 @@ def _evaluate(
 
 
 def _with_terminations(test: TaskCfg, task: TaskCfg) -> TaskCfg:
-    """Return a task for its evaluation, with the terminations of the task `test`."""
+    """Return a task as the task `test` is evaluated: all arms must pass the same test."""
     return test.evaluation.prepare_task(dataclasses.replace(task, terminations=test.terminations))

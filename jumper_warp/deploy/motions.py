@@ -82,7 +82,10 @@ def sign_test(default: np.ndarray, dt: float) -> MotionTest:
     """Extend one leg after the other of a standing robot: the base must tilt away from it, else cables are swapped."""
 
     def fails(leg: int, moved: np.ndarray, change: np.ndarray) -> bool:
-        """Return whether gravity does not turn: a raised front-left corner tilts the base backward and to the right."""
+        """Return whether gravity does not turn: a raised front-left corner tilts the base backward and to the right.
+
+        moved: unused. change: of the unit vector of gravity (3,), body axes.
+        """
         front, left = LEGS[leg]
         return -front * change[0] < LEAST or -left * change[1] < LEAST
 

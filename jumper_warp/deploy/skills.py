@@ -65,7 +65,11 @@ class Motion:
         return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(self.rest_tilt))
 
     def readings(self) -> dict[str, Any]:
-        """Return the readings of `DeployedPolicy.targets` that do not depend on the command."""
+        """Return the readings of `DeployedPolicy.targets` that do not depend on the command.
+
+        height: of the base, world z [m]; lin_vel [m/s], ang_vel [rad/s], gravity: (3,), body axes; angle [rad], rate
+        [rad/s]: (12,).
+        """
         return {
             "height": self.estimate.position[2], "lin_vel": self.velocity, "ang_vel": self.gyro,
             "gravity": self.gravity, "angle": self.q, "rate": self.qd,

@@ -310,7 +310,10 @@ class JumpLog(EvaluationLog):
         return bool((self.current >= count).all())
 
     def _record_heights(self, jump: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Record base heights in stance, and the motors' largest angle in flight; arguments as of `_record_landing`."""
+        """Record base heights, and the largest angle of a transversal motor in flight; arguments: see `_record_landing`.
+
+        Heights are at the command, the lowest from it to takeoff, and the latest.
+        """
         height = jump["base_pos"][:, 2]
         waits = (jump["phase"] == STANCE) & (jump["steps"] <= jump["command_step"])
         prepares = (jump["phase"] == STANCE) & ~waits
@@ -395,7 +398,10 @@ class JumpLog(EvaluationLog):
         return self.goals
 
     def series(self) -> dict[str, np.ndarray]:
-        """Return values to plot: base height, and commanded height or the base's distance from the goal, [m]."""
+        """Return present values to plot, (num_envs,) [m]: base height, and commanded height or distance from the goal.
+
+        In their names {} stands for a robot.
+        """
         series = {"height/base, {} [m]": self.arrays["base_pos"][:, 2]}
         if self.to_heights:
             return series | {"height/command, {} [m]": self.goals[:, 0, 2]}

@@ -30,7 +30,11 @@ RATIO_ROWS = {
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the content of `report.json`: identified and undetermined parameters, fit, steps and effort."""
+    """Return the content of `report.json`: identified and undetermined parameters, fit, steps and effort.
+
+    Values and their intervals are in the parameter's unit. deviation_of_prior: standard deviation over that of the
+    prior, 1: nothing was learnt. mismatch: factor by which errors of the model widen the intervals.
+    """
     rows = []
     for i, parameter in enumerate(result.parameters):
         low, high = result.intervals[i]

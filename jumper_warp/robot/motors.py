@@ -191,7 +191,7 @@ class FilterCfg:
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if horizon or speed floor is out of its range."""
+        """Raise InputError unless horizon is in 1 ms to 10 s, and speed_floor in 1e-3 to 1e4 deg/s."""
         check_types("filter", self)
         check_filter_speed(self.horizon, self.speed_floor)
 
@@ -245,7 +245,8 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Ker
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
     """Return the command filter's settings as an array (14,), in the order and units of `FILTER_NAMES`.
 
-    cfg: None for the filter of vertical jumps. Raises InputError: it is no FilterCfg.
+    Differentiable rollouts read them from an array of each world, w.r.t. which they have gradients. cfg: None for the
+    filter of vertical jumps. Raises InputError: it is no FilterCfg.
     """
     cfg = vertical_jump_filter() if cfg is None else cfg
     if not isinstance(cfg, FilterCfg):

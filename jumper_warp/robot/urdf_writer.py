@@ -38,7 +38,7 @@ def urdf(robot: RobotDescription) -> str:
 
 
 def _write_shapes(element: Element, link: Link) -> None:
-    """Replace the shapes of a link's element; those of a table's robot are upright or along x."""
+    """Replace the shapes of a link's element. Those of a robot from a `robot.json` are upright or along x."""
     for shape in [*element.findall("visual"), *element.findall("collision")]:
         element.remove(shape)
     for tag, shapes in (("visual", link.visuals), ("collision", link.collisions)):

@@ -221,6 +221,7 @@ class ObservationTerm(Term):
     takes: ClassVar = ((RobotView, Any), (RobotParameters, wp.int32), (RobotArrays, Ground, wp.int32))
 
     def __init__(self, func: Function, **values: Any) -> None:
+        """Store a function with its settings and options. Raises InputError as `Term`, or an option is out of range."""
         super().__init__(func, **values)
         if "return" not in get_type_hints(self.func.func):
             where = f"{place_of(self.func)}: ObservationTerm {self.name}"
@@ -286,6 +287,7 @@ class EventTerm(Term):
     takes: ClassVar = ((RobotParameters, RngStream),)
 
     def __init__(self, func: Function, **values: Any) -> None:
+        """Store a function with its settings and options. Raises InputError as `Term`, or for an unknown mode."""
         super().__init__(func, **values)
         mode = self.options["mode"]
         interval = self.numbers["interval_range_s"]

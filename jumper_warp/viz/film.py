@@ -150,6 +150,7 @@ def _images(
 def _shapes(recording: Recording, ranks: Sequence[int]) -> list[ShapeMesh]:
     """Return the shapes that a film shows: those of some worlds, their goals, and those that all worlds share."""
     bodies = {-1}.union(*(recording.body_indices(rank) for rank in ranks))
+    # names of goals begin with goal_<rank>_ or height_<rank>_
     goals = [shape for shape in goal_shapes(recording) if int(shape.name.split("_")[1]) in ranks]
     return [shape for shape in recording.shapes if shape.body in bodies] + goals
 

@@ -93,10 +93,10 @@ class Composition:
         return float(along.min()) - 0.15, float(along.max()) + 0.15 + label
 
     def point(self, along: float, height: float, in_front: float = 0.0) -> np.ndarray:
-        """Return the position (3,) [m] in the world of a point in the picture's vertical plane.
+        """Return the position (3,) [m] in the world of a point in the picture's vertical plane, through the first base.
 
-        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it and
-        of all drawn robots [m], if not 0.
+        along: distance to the right of the world's origin [m]; height: world z [m]; in_front: of the plane and of all
+        drawn robots [m], if not 0.
         """
         depths = (self.base[self.frames] if in_front else self.base[:1]) @ self.toward_eye
         depth = depths.max() + in_front

@@ -95,7 +95,7 @@ class Renderer(ABC):
         self.load(shapes, num_bodies, opacity)
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """Load the bodies to draw, one copy of all bodies for each entry of `opacity`.
+        """Load the bodies to draw, one copy of all bodies for each entry of `opacity`: moments in one picture.
 
         Shapes that are fixed to the world are loaded once. num_bodies: number of bodies that `ShapeMesh.body` indexes.
         opacity: of each copy, 0 to 1.

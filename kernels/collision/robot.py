@@ -252,7 +252,10 @@ def add_distance(collisions: Collisions, distance: real, least: real, flag: int)
 def load_leg(
     geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), world: int, start: int, leg: int
 ) -> LegCapsules:
-    """Return the capsules that model leg 0 to 3 of a world, whose coordinates begin at index `start` of joint_q."""
+    """Return the capsules that model leg 0 to 3 of a world, whose coordinates begin at index `start` of joint_q.
+
+    They are 7 of the base, then of each leg the angles [rad] lateral, outer, outer knee, inner, inner knee.
+    """
     motor = start + 7 + 5 * leg
     return leg_capsules(
         leg_of(geometry, world, leg), real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3])

@@ -73,7 +73,10 @@ def moved_away(robot: RobotView, state: JumpState, distance: float) -> bool:
 
 @wp.func
 def left_stance(robot: RobotView, state: JumpState, distance: float) -> bool:
-    """Terminate in stance if the base is more than `distance` [m] from the start of the jump, horizontally."""
+    """Terminate in stance if the base is more than `distance` [m] from the start of the jump, horizontally.
+
+    A robot must jump to its goal, and not walk there.
+    """
     return state.phase == STANCE and moved_away(robot, state, distance)
 
 

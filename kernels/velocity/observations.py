@@ -31,7 +31,7 @@ def gait_phase(robot: RobotView, state: VelocityState) -> wp.vec2:
 
 @wp.func
 def command_age(robot: RobotView, state: VelocityState) -> float:
-    """Time since the last command [s], at most 2."""
+    """Time since the last command [s], at most 2: an error right after a command is no fault."""
     return wp.min(float(state.command_steps) / POLICY_RATE, 2.0)
 
 

@@ -58,11 +58,11 @@ class AttitudeResetCfg:
     default_pose_probability: float = 0.3
     """[1] Probability of a start in the default pose."""
     lateral: Pair = (-20.0, 80.0)
-    """[deg] Lateral motor angles in starts outside the default pose."""
+    """[deg] Lateral motor angles, positive outward, in starts outside the default pose."""
     transversal: Pair = (0.0, 105.0)
-    """[deg] Outer and inner motor angles in starts outside the default pose."""
+    """[deg] Outer and inner motor angles, positive away from the other thigh, in starts outside the default pose."""
     spin: float = 0.0
-    """[rad/s] Largest angular velocity about each axis at the start; 0: no angular momentum."""
+    """[rad/s] Largest angular velocity about each world axis at the start; 0: no angular momentum."""
 
     struct = AttitudeSettings
     """Type of the kernel struct that `values` returns."""
