@@ -310,7 +310,7 @@ class JumpLog(EvaluationLog):
         return bool((self.current >= count).all())
 
     def _record_heights(self, jump: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Record base heights, and the largest angle of a transversal motor in flight; arguments: see `_record_landing`.
+        """Record base heights, and the largest angle of a transversal motor in flight; see `_record_landing`.
 
         Heights are at the command, the lowest from it to takeoff, and the latest.
         """
