@@ -220,7 +220,8 @@ def watches(args: Sequence[str]) -> list[TrainingWatch]:
 
     `parse_train` returns a recipe, and a recipe holds nothing about terminals and viewers.
     """
-    watched = "--watch" in args
+    switches = [arg for arg in args if arg in ("--watch", "--no-watch")]
+    watched = switches[-1:] == ["--watch"]
     every = int((values_of("--video-every", args) or ["0"])[-1])
     if not watched and every == 0:
         return []

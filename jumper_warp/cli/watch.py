@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Literal
 
 from jumper_warp.cli.main import UsageError, parse
+from jumper_warp.utils.checks import check_not_negative
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     cfg = parse(WatchArgs, "watch RUN", args[named:])
     if not named:
         raise UsageError("the run comes first: jumper watch RUN [flags]")
+    if cfg.seconds is not None:
+        check_not_negative("seconds", cfg.seconds)
     from jumper_warp.live.feed import live_address
     from jumper_warp.viz.rerun_server import announce
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -80,7 +81,8 @@ def report_non_finite(
     found: list[NonFiniteValue] = getattr(env, "non_finite", list)()  # optional for a `VecEnv`
     for value in found:
         prefix = f"rank_{rank}_" if rank else ""
-        path = folder / DUMPS / f"{prefix}{value.term.replace('/', '_')}.npz"
+        name = re.sub(r"[^\w.-]", "_", value.term)
+        path = folder / DUMPS / f"{prefix}{name}.npz"
         try:
             write_dump(path, value, iteration=iteration, task=config["train"]["task"], config=config)
             print_line(f"{value}; jumper play --dump {path}")

@@ -38,12 +38,12 @@ def place_of(definition: object) -> str:
     try:
         return f"{Path(inspect.getsourcefile(source) or '').name}:{inspect.getsourcelines(source)[1]}"
     except (OSError, TypeError):  # without a file, as in a terminal
-        return source.__module__
+        return source.__module__ or ""
 
 
 def is_own(definition: object) -> bool:
     """Return whether a user defined a Warp function, a struct or an object's class, outside this project."""
-    return not source_of(definition).__module__.startswith(PROJECT_PREFIX)
+    return not (source_of(definition).__module__ or "").startswith(PROJECT_PREFIX)  # None: made by exec
 
 
 def shown_type(kind: Any) -> str:

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from hold_height import hold_height
+from jumper_warp.cli.train import watches
+from jumper_warp.cli.watch import run as run_watch
 from jumper_warp.envs.env import Env
 from jumper_warp.live.buffer import WorldBuffer
 from jumper_warp.live.clips import ROLES, Player
@@ -143,6 +145,17 @@ def test_player_drops_an_episode_with_lost_steps():
 def test_a_negative_number_of_iterations_between_films_is_refused():
     with pytest.raises(InputError, match="video_every"):
         TrainingWatch("none", video_every=-1)
+
+
+@pytest.mark.parametrize("flags", [["--watch", "--no-watch"], ["--no-watch"], []])
+def test_the_last_of_two_flags_of_watching_counts(flags):
+    assert watches(flags) == []
+    assert len(watches([*flags, "--watch"])) == 1
+
+
+def test_a_negative_time_of_watching_is_refused(tmp_path):
+    with pytest.raises(InputError, match="seconds must be"):
+        run_watch([str(tmp_path), "--seconds", "-1"])
 
 
 class KilledWatch(TrainingWatch):

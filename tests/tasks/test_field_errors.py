@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import hold_height
+from jumper_warp.tasks.functions import is_own, place_of
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import module_from_file
 
@@ -62,3 +63,12 @@ def test_own_fault_is_refused_by_the_task_in_one_line(right, wrong, message, mak
     with pytest.raises(InputError) as refusal:
         make(right, wrong)
     assert message in str(refusal.value)
+
+
+def test_term_of_a_module_without_name_is_a_users(tmp_path):
+    path = tmp_path / "cell.py"
+    term = "@wp.func\ndef one(robot: mdp.RobotView) -> float:\n    return 1.0\n"
+    path.write_text(f"import warp as wp\nfrom jumper_warp import mdp\n{term}")
+    names = {}
+    exec(compile(path.read_text(), path, "exec"), names)  # as code that generates rewards
+    assert is_own(names["one"]) and place_of(names["one"]) is not None
