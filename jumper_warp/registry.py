@@ -87,7 +87,7 @@ class TaskEntry:
 
         Raises InputError: it is invalid, no TaskCfg, or has another name.
         """
-        from jumper_warp.robot.overlay import robots_of
+        from jumper_warp.robot.overlay import RobotOverlay
         from jumper_warp.tasks.cfg import TaskCfg
 
         make = self.factory()
@@ -102,7 +102,8 @@ class TaskEntry:
             raise InputError(f"task {name!r} of {self.origin}: expected a TaskCfg, got {type(task).__name__}")
         if task.name != name:
             raise InputError(f"task {name!r} of {self.origin} calls itself {task.name!r:.60}; give both the same name")
-        if robot is None or robots_of(robot)[0].is_jumper or not self.of_project:
+        check_type("robot", robot, RobotOverlay | None)
+        if robot is None or robot.is_jumper or not self.of_project:
             return task
         from jumper_warp.sim.apex import jumper_measures, measure
         from jumper_warp.tasks.scaling import scaled
