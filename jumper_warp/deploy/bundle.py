@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +18,7 @@ from jumper_warp.deploy.codec import Codec
 from jumper_warp.deploy.control import Gains, TorqueCurve
 from jumper_warp.deploy.policy import DeployedPolicy
 from jumper_warp.deploy.safety import Safety
+from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import read_file
 
@@ -39,7 +39,7 @@ class Bundle:
             self.settings: dict[str, Any] = yaml.safe_load(read_file(self.folder / FILE, "settings of a bundle"))
             if self.settings.get("version") != VERSION:
                 raise InputError(f"{self.folder / FILE}: expected version {VERSION} of a bundle: export it again")
-            check_numbers("", self.settings)
+            check_all_finite(f"{self.folder / FILE}:", self.settings)
             self.joints = JointMap(self.settings)
             Safety(self.settings["safety"], self.settings["closed_chain"]["transversal_sum"])
             self.curve = TorqueCurve(**{k: np.array(v, np.float32) for k, v in self.settings["torque_curve"].items()})
@@ -121,13 +121,16 @@ class JointMap:
         return frames
 
 
-def check_numbers(name: str, value: Any) -> None:
-    """Raise ValueError if a number in nested settings is not finite: a limit of NaN is never exceeded."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{name[1:]} is {value}")
+def check_all_finite(name: str, value: Any) -> None:
+    """Raise InputError, which begins with `name`, if a number in nested settings is not finite.
+
+    A limit of NaN is never exceeded.
+    """
+    if isinstance(value, float):
+        check_finite(name, value)
     entries = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
     for key, entry in entries:
-        check_numbers(f"{name}.{key}", entry)
+        check_all_finite(f"{name} {key}", entry)
 
 
 def settings_hash(settings: Mapping[str, Any]) -> str:

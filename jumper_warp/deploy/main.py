@@ -110,22 +110,21 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
             last = (runtime.state, runtime.reason)
             print(f"{runtime.state.name} {runtime.reason.name if runtime.reason else ''}", flush=True)
 
-    until_stopped = ExitStack()  # also for the ticks that brake
-    try:
-        with raw_terminal():
-            if options.lockstep:
-                for _ in itertools.takewhile(lambda number: number < options.seconds * rate, itertools.count()):
-                    tick(0.0)
-            else:
-                until_stopped.enter_context(real_time())
-                result = run_loop(tick, rate, options.seconds)
-                print(json.dumps(result | {"replies_lost": 1.0 - replies / (12 * result["ticks"])}))
-    except KeyboardInterrupt:
-        pass
-    finally:
-        for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
-            runtime.tick(request)
-        until_stopped.close()
+    with ExitStack() as until_stopped:  # also for the ticks that brake
+        try:
+            with raw_terminal():
+                if options.lockstep:
+                    for _ in itertools.takewhile(lambda number: number < options.seconds * rate, itertools.count()):
+                        tick(0.0)
+                else:
+                    until_stopped.enter_context(real_time())
+                    result = run_loop(tick, rate, options.seconds)
+                    print(json.dumps(result | {"replies_lost": 1.0 - replies / (12 * result["ticks"])}))
+        except KeyboardInterrupt:
+            pass
+        finally:
+            for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+                runtime.tick(request)
         if dog is not None:
             dog.close()
         link.close()

@@ -93,9 +93,9 @@ class RobotOverlay:
         """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
         for name in ("values", "randomization"):  # arrays become tuples, which JSON can hold
             check_type(f"robot overlay: {name}", getattr(self, name), Mapping)
-            pairs = {key: tuple(row.tolist() if isinstance(row, np.ndarray) and row.ndim == 1 else row)
-                     if isinstance(row, np.ndarray | list) else row
-                     for key, row in getattr(self, name).items()}  # fmt: skip
+            rows = getattr(self, name)
+            arrays = {key: real_array(row, f"robot overlay: {key}", float) for key, row in rows.items()}
+            pairs = {key: tuple(array.tolist()) if array.ndim == 1 else rows[key] for key, array in arrays.items()}
             object.__setattr__(self, name, pairs)
         check_types("robot overlay", self)
         check_names("quantity", self.values, (*RANGES, *LENGTHS))

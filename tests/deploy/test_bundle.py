@@ -99,10 +99,10 @@ def test_mistake_in_the_settings_fails_the_check(change, bundle_folder, tmp_path
 @pytest.mark.parametrize(
     ("section", "name", "value", "message"),
     [
-        ("safety", "max_rate", math.nan, "safety.max_rate is nan"),
-        ("safety", "max_tilt", math.inf, "safety.max_tilt is inf"),
-        ("safety", "upper", [*11 * [100.0], math.nan], "safety.upper.11 is nan"),
-        ("hold", "torque_limit", 12 * [math.nan], "hold.torque_limit.0 is nan"),
+        ("safety", "max_rate", math.nan, "safety max_rate must be finite"),
+        ("safety", "max_tilt", math.inf, "safety max_tilt must be finite"),
+        ("safety", "upper", [*11 * [100.0], math.nan], "safety upper 11 must be finite"),
+        ("hold", "torque_limit", 12 * [math.nan], "hold torque_limit 0 must be finite"),
         ("safety", "lower", 11 * [-50.0], "need 12 angles"),
         ("safety", "upper", "", "need 12 angles"),
         (None, "policies", {}, "no policies"),
