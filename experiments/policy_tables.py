@@ -40,10 +40,10 @@ SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
 KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
 POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
-RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else success_rate
+RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else that in range
 ERRORS = {
     "height": ("in_range_apex_error_abs_mean_m", 1000.0, "{:.1f} mm"),
-    "place": ("goal_distance_at_rest_mean_m", 1000.0, "{:.1f} mm"),
+    "place": ("in_range_goal_distance_at_rest_mean_m", 1000.0, "{:.1f} mm"),
     "velocity": ("settled_rmse_vx_m_s", 1.0, "{:.3f} m/s"),
     "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
 }
@@ -127,6 +127,11 @@ def trials_of(row: Row) -> str:
     return f"{max(value.trials or 0 for value in row.metrics.values()):,}"
 
 
+def goals_in_range(success: MetricValue) -> str:
+    """Return the range of commands, such as "0.5 to 1.1 m", over which a success rate was taken."""
+    return str(success.over).partition("goals of ")[2]
+
+
 def first_seed(policy: str) -> dict[str, Row]:
     """Return the saved rows of a policy with the smallest seed, by condition."""
     return {row.condition: row for row in reversed(saved_rows(policy))}
@@ -152,7 +157,7 @@ def main_table(policy: str, task: TaskCfg) -> str:
     nominal = rows["nominal"]
     note = f"{trials_of(nominal)} trials a column; commands: {nominal.values['commands']}"
     if kind_of(task) == "height":
-        note += "; in range: " + str(nominal.metrics["in_range_success_rate"].over).partition("goals of ")[2]
+        note += "; in range: " + goals_in_range(nominal.metrics["in_range_success_rate"])
     note += f".\n{together.capitalize()}: {' / '.join(robot)}" if robot else ""
     return markdown(["", *titles, *([together] if robot else [])], lines) + f"\n{note}.\n"
 
@@ -254,7 +259,14 @@ def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
         page = "mars" if policy.startswith("mars") else POLICY_PAGES[kind_of(task)]
         values = rows[tests[0]].values
         speed = values.get("speed_m_s")
-        tested = str(values["commands"]) if speed is None else f"bumps, slopes, steps at {speed} m/s"
+        in_range = rows[tests[0]].metrics.get("in_range_success_rate")
+        tested = (
+            goals_in_range(in_range)
+            if in_range
+            else str(values["commands"])
+            if speed is None
+            else f"bumps, slopes, steps at {speed} m/s"
+        )
         cells = [_success(rows[test], kind_of(task)) if test in rows else "" for test in tests]
         trained = trained_on(task, rows["nominal"].values)
         lines.append([need["need"], f"[{policy}]({page}.md)", tested, *cells, trained, need["unless"]])
@@ -268,7 +280,7 @@ def _success(row: Row, kind: str) -> str:
         rates = [metric.value for name, metric in row.metrics.items() if name.endswith("_fall_rate")]
         parts = [f"{number('fall_rate', max(rate for rate in rates if isinstance(rate, float)))} fall"]
     else:
-        rate = RATES.get(kind, "success_rate")
+        rate = RATES.get(kind, "in_range_success_rate")
         (key, factor, text) = ERRORS[kind]
         share = number(rate, row.metrics[rate].value).replace("100.0", "100")
         error = row.metrics[key].value

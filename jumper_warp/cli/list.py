@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from jumper_warp.policies.catalog import PolicySummary
 
 LEGEND = """\
-success, error: nominal robot. A jump succeeds within 0.1 m of its goal, landed
-and at rest; a walk without a fall; a turn if it settles. error: mean of jumps
-and turns, RMSE of the velocity ahead of walks. size: of the network's file.
+success, error: nominal robot, commands in range. A jump succeeds within 0.1 m
+of its goal, landed and at rest; a walk without a fall; a turn if it settles.
+error: mean of jumps and turns, RMSE of the velocity ahead of walks.
+size: of the network's file.
 
 jumper info NAME shows a task or a policy."""
 

@@ -45,9 +45,12 @@ REPLACED = {
 """Policy in place of each earlier one."""
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
-SUCCESSES = ("success_rate", "settled_without_collision_rate")
+SUCCESSES = ("in_range_success_rate", "success_rate", "settled_without_collision_rate")
 """Keys of the success rate; a policy's is the first one that its metrics have."""
-ERRORS = ("apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "settled_rmse_vx_m_s", "error_at_end_mean_deg")
+ERRORS = (
+    "in_range_apex_error_abs_mean_m", "in_range_goal_distance_at_rest_mean_m", "apex_error_abs_mean_m",
+    "goal_distance_at_rest_mean_m", "settled_rmse_vx_m_s", "error_at_end_mean_deg",
+)  # fmt: skip
 """Keys of the error; a policy's is the first one that its metrics have."""
 
 
@@ -239,7 +242,10 @@ class PolicySummary:
 
     @property
     def success(self) -> float | None:
-        """Success rate in the first test condition, for walking the rate without a fall; None: not evaluated."""
+        """Success rate in the first test condition, for walking the rate without a fall; None: not evaluated.
+
+        That of a jump is over the range of commands of its task's evaluation in which it should succeed.
+        """
         rates = [self.metrics[key]["value"] for key in SUCCESSES if key in self.metrics]
         falls = self.metrics.get("fall_rate", {"value": None})["value"]
         return rates[0] if rates else None if falls is None else 1.0 - falls
