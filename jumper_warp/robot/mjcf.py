@@ -6,7 +6,6 @@ are wxyz in MJCF and xyzw in this project; sizes of shapes are halved.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
@@ -88,7 +87,7 @@ def _add_defaults(root: Element, paw_friction: float) -> None:
     add(visual, "geom", contype="0", conaffinity="0", group="2", mass=0)
     paw = add(defaults, "default", class_="paw")
     # with priority, the paw's friction and softness hold on every ground, and paws do not collide with each other
-    ratio = 0.5 * CONTACT_DAMPING / math.sqrt(CONTACT_STIFFNESS)
+    ratio = 0.5 * CONTACT_DAMPING / CONTACT_STIFFNESS**0.5
     softness = {"solref": (2.0 / CONTACT_DAMPING, ratio), "solimp": CONTACT_IMPEDANCE}
     add(paw, "geom", contype="1", conaffinity="0", priority="1", condim="3", group="3",
         friction=(paw_friction, 0.005, 0.0001), **softness)  # fmt: skip
