@@ -123,6 +123,7 @@ function open(next) {
   name = next;
   info = null;
   $("loading").hidden = false;
+  $("scene").blur();
   figure("", "");
   worker.postMessage({ type: "open", scene: name });
 }
@@ -157,10 +158,7 @@ for (const [planet, gravity] of Object.entries(PLANETS)) {
     set("gravity")(gravity);
   };
 }
-$("scene").onchange = ({ target }) => {
-  open(target.value);
-  target.blur();
-};
+$("scene").onchange = ({ target }) => open(target.value);
 for (const id of ["jumpUp", "push", "reset"]) $(id).onclick = actions[id];
 for (const each of document.querySelectorAll("button, input, summary")) each.addEventListener("pointerup", () => each.blur());
 $("theme").onclick = () => {
