@@ -218,8 +218,10 @@ def test_console_has_no_errors_and_nothing_is_fetched_elsewhere(visitor):
 
 def overlapping(page, *selectors):
     """Return the pairs of elements whose boxes overlap, or leave the window's width."""
-    boxes = {name: page.locator(name).bounding_box() for name in selectors}
-    ends = {name: (box["x"], box["x"] + box["width"], box["y"], box["y"] + box["height"]) for name, box in boxes.items()}
+    ends = {}
+    for name in selectors:
+        box = page.locator(name).bounding_box()
+        ends[name] = (box["x"], box["x"] + box["width"], box["y"], box["y"] + box["height"])
     outside = [name for name, (left, right, *_) in ends.items() if left < 0 or right > page.viewport_size["width"]]
     return outside + [
         (one, other)
