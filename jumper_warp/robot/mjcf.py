@@ -14,6 +14,7 @@ from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.model import (
     CONTACT_DAMPING,
     CONTACT_IMPEDANCE,
+    CONTACT_STIFFNESS,
     GROUND_COLOR,
     LOOP_IMPEDANCE,
     PHYSICS_DT,
@@ -86,7 +87,8 @@ def _add_defaults(root: Element, paw_friction: float) -> None:
     add(visual, "geom", contype="0", conaffinity="0", group="2", mass=0)
     paw = add(defaults, "default", class_="paw")
     # with priority, the paw's friction and softness hold on every ground, and paws do not collide with each other
-    softness = {"solref": (2.0 / CONTACT_DAMPING, 1), "solimp": CONTACT_IMPEDANCE}
+    ratio = 0.5 * CONTACT_DAMPING / CONTACT_STIFFNESS**0.5
+    softness = {"solref": (2.0 / CONTACT_DAMPING, ratio), "solimp": CONTACT_IMPEDANCE}
     add(paw, "geom", contype="1", conaffinity="0", priority="1", condim="3", group="3",
         friction=(paw_friction, 0.005, 0.0001), **softness)  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import functools
 import http.server
+import itertools
 import os
 import shutil
 import threading
@@ -120,6 +121,27 @@ def test_space_makes_the_robot_jump_to_the_height(visitor):
     assert "0.90 m asked" in visitor.locator("#figures").inner_text()
 
 
+def test_gamepad_walks_turns_jumps_pushes_and_resets(visitor):
+    visitor.evaluate("""() => {
+        window.pad = { axes: [0.1, -1, -1, 0], buttons: [0, 0, 0].map(() => ({ pressed: false })) };
+        navigator.getGamepads = () => [null, pad];
+    }""")
+    visitor.wait_for_function("page.state.position[0] > 0.2 && page.state.yaw > 0.3")
+    visitor.evaluate("pad.axes = [0.1, 0.1, -0.1, 0]")
+    visitor.wait_for_function("Math.hypot(...page.state.velocity) < 0.05")
+    jumps = len(visitor.evaluate("page.jumps"))
+    press = "button => { pad.buttons.forEach((each, i) => { each.pressed = i === button; }); }"
+    visitor.evaluate(press, 0)
+    assert abs(landing_error(visitor, jumps)) < 0.03
+    visitor.wait_for_timeout(300)  # [ms]
+    assert visitor.evaluate("page.state.skill") == "walk" and not visitor.evaluate("page.state.waiting")  # acts once
+    visitor.evaluate(press, 1)
+    visitor.wait_for_function("Math.hypot(...page.state.velocity) > 0.15")
+    visitor.evaluate(press, 2)
+    visitor.wait_for_function("Math.hypot(...page.state.position.slice(0, 2)) < 0.02")
+    visitor.evaluate("delete navigator.getGamepads")
+
+
 def test_push_and_drag_are_survived(visitor):
     visitor.keyboard.press("p")
     visitor.wait_for_function("Math.hypot(...page.state.velocity) > 0.15")
@@ -194,6 +216,20 @@ def test_console_has_no_errors_and_nothing_is_fetched_elsewhere(visitor):
     assert visitor.evaluate("page.scene.renderer.info.render.calls") <= 60
 
 
+def overlapping(page, *selectors):
+    """Return the pairs of elements whose boxes overlap, or leave the window's width."""
+    ends = {}
+    for name in selectors:
+        box = page.locator(name).bounding_box()
+        ends[name] = (box["x"], box["x"] + box["width"], box["y"], box["y"] + box["height"])
+    outside = [name for name, (left, right, *_) in ends.items() if left < 0 or right > page.viewport_size["width"]]
+    return outside + [
+        (one, other)
+        for one, other in itertools.combinations(ends, 2)
+        if all(ends[one][i] < ends[other][i + 1] and ends[other][i] < ends[one][i + 1] for i in (0, 2))
+    ]
+
+
 def test_phone_walks_and_jumps_by_touch(browser, address, visitor):
     visitor.close()  # leaves the processor to the phone
     phone = opened(browser, address, viewport={"width": 390, "height": 700}, has_touch=True, is_mobile=True)
@@ -208,7 +244,17 @@ def test_phone_walks_and_jumps_by_touch(browser, address, visitor):
     x, y, _ = phone.evaluate("page.state.position")
     phone.touchscreen.tap(*window_point(phone, x + 0.6, y - 0.3))
     assert landing_error(phone, 0) < 0.05
-    box = phone.locator("#bar").bounding_box()
-    assert box["x"] >= 0.0
-    assert box["x"] + box["width"] <= 390.0
+    for width, height in ((390, 844), (844, 390)):
+        phone.set_viewport_size({"width": width, "height": height})
+        assert overlapping(phone, "#stick", "#bar", "#hint", "#figures", "summary") == []
+        phone.wait_for_timeout(300)  # [ms] of a frame in the new size
+        _, robot = window_point(phone, *phone.evaluate("page.state.position.slice(0, 2)"))
+        hint = phone.locator("#hint").bounding_box()
+        assert not hint["y"] - 40 < robot < hint["y"] + hint["height"]
+        phone.locator("summary").tap()
+        assert overlapping(phone, "#stick", "#jumpUp", "#panel") == []
+        phone.locator("#speed").tap()  # scrolls to it
+        assert phone.locator("#speed-value").inner_text() == "0.55 ×"
+        phone.locator("#speed").fill("1")
+        phone.locator("summary").tap()
     assert phone.errors == [] or all("GPU stall" in error for error in phone.errors)

@@ -65,7 +65,7 @@ def test_constants_agree_with_those_that_newton_compiles():
     np.testing.assert_allclose(*(mass_matrix(m, data.qpos) for m in (model, other)), atol=1e-6)
     for name in ("geom_solref", "geom_solimp", "geom_friction"):
         values = [getattr(m, name)[m.geom_bodyid > 0][-1] for m in (model, other)]  # of a paw
-        np.testing.assert_allclose(*values, rtol=1e-3, err_msg=name)
+        np.testing.assert_allclose(*values, rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(model.eq_solimp, warp.eq_solimp.numpy()[0], rtol=1e-6)
     raised = np.maximum(model.eq_solref, [2 * model.opt.timestep, 0.0])  # as MuJoCo does
     np.testing.assert_allclose(raised, warp.eq_solref.numpy()[0], rtol=1e-6)

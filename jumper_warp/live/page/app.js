@@ -48,6 +48,7 @@ const actions = {
     if (!ready()) return wait();
     const height = Number($("height").value);
     figure("…", `${meters(height)} asked`);
+    say(HINT, 0);
     send("jumpUp", { height });
   },
   jumpTo: (place) => {
@@ -105,7 +106,7 @@ const receive = {
     page.jumps.push(jump);
     scene.showJump(jump);
     if (!jump.made) figure("no jump", "It stayed on the ground.");
-    else if (jump.height) figure(meters(jump.apex, 3), `${meters(jump.height)} asked, ${meters(jump.apex, 3)} reached`);
+    else if (jump.height) figure(meters(jump.apex, 3), `reached, ${meters(jump.height)} asked`);
     else figure(`${(100 * jump.error).toFixed(1)} cm off`, `${meters(jump.length)} far, ${meters(jump.apex)} high`);
   },
   times: (times) => { page.times = times; },
@@ -122,6 +123,7 @@ function open(next) {
   name = next;
   info = null;
   $("loading").hidden = false;
+  $("scene").blur();
   figure("", "");
   worker.postMessage({ type: "open", scene: name });
 }
@@ -140,7 +142,7 @@ function slider(id, text, send) {
 const set = (key) => (value) => {
   send("set", { name: key, value });
   const other = key === "gravity" && Math.abs(value - info?.gravity) > 1;
-  if (other) say("These policies were trained with the gravity of this scene: they may fall with another one.");
+  if (other) say("These policies were trained with the gravity of this scene: with another one they miss or fall.");
 };
 slider("height", (x) => meters(x));
 slider("friction", (x) => x.toFixed(2), set("friction"));
@@ -156,10 +158,7 @@ for (const [planet, gravity] of Object.entries(PLANETS)) {
     set("gravity")(gravity);
   };
 }
-$("scene").onchange = () => {
-  open($("scene").value);
-  $("scene").blur();
-};
+$("scene").onchange = ({ target }) => open(target.value);
 for (const id of ["jumpUp", "push", "reset"]) $(id).onclick = actions[id];
 for (const each of document.querySelectorAll("button, input, summary")) each.addEventListener("pointerup", () => each.blur());
 $("theme").onclick = () => {
