@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.diff.rollout import Rollout, Trajectory, compact
-from jumper_warp.kernels.layout import COORDS, DOFS
+from jumper_warp.kernels.layout import DOFS
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import PHYSICS_DT, build_model, standing_configuration
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
@@ -81,7 +81,7 @@ class PlainJump:
                     modules.command_filter.command_filter_kernel,
                     dim=(4, n),
                     device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits],
+                    inputs=[0, target, self._q, self._qd, motors.offset, limits],
                     outputs=[filtered],
                 )
                 dynamics.advance(PHYSICS_DT, SUBSTEPS, drive, self._q, self._qd, self._q, self._qd)
