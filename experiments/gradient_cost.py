@@ -11,15 +11,16 @@ thread of a CPU. The errors of the gradient are relative to double precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
-from gradient_check import PUSH, TICKS, schedule, start
 from jumper_warp.diff.rollout import Rollout, Trajectory, compact
-from jumper_warp.kernels.layout import COORDS, DOFS
-from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.kernels.layout import DOFS
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.model import PHYSICS_DT, build_model, standing_configuration
 from jumper_warp.robot.motors import filter_params, jumping_motors, vertical_jump_filter
 from jumper_warp.sim.dynamics import TOLERANCE
 from jumper_warp.sim.simulation import SUBSTEPS
@@ -27,6 +28,26 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.scripts import DeviceArgs, report, run_script
 from support.timing import device_memory, wall_time
+
+TICKS = 36  # Number of policy steps of 1/60 s of the jump
+SQUAT = math.radians(85.0)  # [rad] Transversal angle of the squat
+PUSH = (-5.0, -8.0)  # [deg] Outer and inner command of the push-off; the filter binds, the motors saturate at first
+
+
+def schedule() -> np.ndarray:
+    """Return the motor targets [rad], (TICKS, 12), of a jump: squat, then push-off."""
+    targets = np.zeros((TICKS, 4, 3))
+    targets[:2, :, 1:] = SQUAT
+    targets[2:, :, 1:] = np.radians(PUSH)
+    return targets.reshape(TICKS, 12)
+
+
+def start() -> tuple[np.ndarray, np.ndarray]:
+    """Return the jump's initial state, a squat: coordinates (43,) and rates (38,)."""
+    squat = replace(load_description(), poses={"squat": (0.0, SQUAT)})
+    q = standing_configuration(squat, "squat")
+    q[2] -= 1.0e-4  # paws 0.1 mm in the ground, so that contacts do not switch
+    return q, np.zeros(38)
 
 
 class PlainJump:
@@ -60,7 +81,7 @@ class PlainJump:
                     modules.command_filter.command_filter_kernel,
                     dim=(4, n),
                     device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits],
+                    inputs=[0, target, self._q, self._qd, motors.offset, limits],
                     outputs=[filtered],
                 )
                 dynamics.advance(PHYSICS_DT, SUBSTEPS, drive, self._q, self._qd, self._q, self._qd)
@@ -94,7 +115,7 @@ class GradientRun:
             model, jumping_motors(), vertical_jump_filter(), double=double, tolerance=TOLERANCE, threads=1
         )
         self._q, self._qd = (self.rollout.array(np.repeat(row, worlds, axis=1)) for row in compact(*start()))
-        self._targets = self.rollout.array(np.repeat(schedule(PUSH)[:, :, None], worlds, axis=2))
+        self._targets = self.rollout.array(np.repeat(schedule()[:, :, None], worlds, axis=2))
         trajectory = self.forward()
         cotangent = np.zeros(trajectory.q.shape)
         cotangent[-1, 2] = 1.0
@@ -131,7 +152,7 @@ def main(args: Args) -> dict:
     exact = GradientRun(1, True, args.device).run()
     before = device_memory(device) if device.is_cuda else 0
     differentiable = GradientRun(worlds, args.double, args.device)
-    plain = PlainJump(differentiable.rollout, schedule(PUSH))
+    plain = PlainJump(differentiable.rollout, schedule())
     gradient = differentiable.run()
     errors = {  # largest error in world 0 (worlds last) relative to the largest entry, by input of the rollout
         key: float(np.abs(gradient[key].numpy()[..., 0] - exact[key].numpy()[..., 0]).max())

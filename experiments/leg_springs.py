@@ -13,14 +13,13 @@ sequel has 1000 N/m and 0.17 m.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from jumper_warp.robot.gravity import EARTH, MARS
-from jumper_warp.robot.motors import MotorCfg, jumping_motors, loose_filter, vertical_jump_filter
+from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.apex import EXTEND, HOLD, RAMP
 from jumper_warp.sim.simulation import Simulation
@@ -44,46 +43,6 @@ def transversal_command(step: int, squat: float) -> float:
     return float(np.radians(45.0 + (squat - 45.0) * np.clip((step - STAND) / RAMP, 0.0, 1.0)))
 
 
-@dataclass(frozen=True)
-class SpringJumps:
-    """Open-loop jumps with given motors, command filter, gravity and spring length."""
-
-    motors: MotorCfg  # Gains and limits of the motors
-    filter: str  # One of FILTERS
-    gravity: float  # [m/s^2] Downward
-    length: float  # [m] Rest length of the springs
-    device: str | None  # Warp device, None: the default
-
-    def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
-        """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).
-
-        All are parallel worlds of one simulation. The legs stay extended in flight, since only the apex counts.
-        stiffness [N/m]: of the springs; squats [deg]: commanded transversal angles of the squat.
-        """
-        shape = (len(stiffness), len(squats))
-        robots = RobotValues.nominal(shape[0] * shape[1])
-        robots.spring_stiffness[:, 0] = np.repeat(stiffness, shape[1])
-        robots.spring_length[:, 0] = self.length
-        sim = Simulation(
-            shape[0] * shape[1],
-            motors=self.motors,
-            command_filter=FILTERS[self.filter](),
-            gravity=self.gravity,
-            robot=robots,
-            visuals=False,
-            device=self.device,
-        )
-        apex = np.zeros(sim.num_worlds)
-        extend_step = STAND + RAMP + HOLD
-        for tick in range(extend_step + EXTEND + FALLING):
-            commands = [transversal_command(tick, squat) for squat in squats]
-            sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
-            sim.step()
-            if tick >= extend_step:
-                apex = np.maximum(apex, sim.joint_q()[:, 2])
-        return apex.reshape(shape)
-
-
 SUMMARY = ("apex_without_springs_m", "highest_apex_height_m", "highest_stiffness_n_m")  # Ends of keys
 
 
@@ -102,11 +61,31 @@ class Args(DeviceArgs):
     filter: Literal["both", "stock", "loose"] = "both"
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
 
-    def jumps(self, name: str) -> SpringJumps:
-        """Return the jumps with knee springs for these flags and the command filter `name`, a key of FILTERS."""
+    def apexes(self, command_filter: str) -> np.ndarray:
+        """Simulate the jumps: return the largest base height [m] of each, (stiffnesses, squat angles).
+
+        All are parallel worlds of one simulation. The legs stay extended in flight, since only the apex counts.
+        command_filter: a key of FILTERS.
+        """
+        shape = (len(self.stiffness), len(self.squat_angles))
+        robots = RobotValues.nominal(shape[0] * shape[1])
+        robots.spring_stiffness[:, 0] = np.repeat(self.stiffness, shape[1])
+        robots.spring_length[:, 0] = self.rest_length
         motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
-        return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)
+        sim = Simulation(
+            shape[0] * shape[1], motors=motors, command_filter=FILTERS[command_filter](), gravity=self.gravity,
+            robot=robots, visuals=False, device=self.device,
+        )  # fmt: skip
+        apex = np.zeros(sim.num_worlds)
+        extend_step = STAND + RAMP + HOLD
+        for tick in range(extend_step + EXTEND + FALLING):
+            commands = [transversal_command(tick, squat) for squat in self.squat_angles]
+            sim.target.assign(np.outer(np.tile([0.0, 1.0, 1.0], 4), np.tile(commands, shape[0])).astype(np.float32))
+            sim.step()
+            if tick >= extend_step:
+                apex = np.maximum(apex, sim.joint_q()[:, 2])
+        return apex.reshape(shape)
 
 
 def main(args: Args) -> dict:
@@ -118,8 +97,7 @@ def main(args: Args) -> dict:
     title = f"Open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
     with figure(folder / "springs.png", figsize=(7, 5), title=title) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
-            jumps = args.jumps(name)
-            apexes = jumps.apexes(args.stiffness, args.squat_angles)
+            apexes = args.apexes(name)
             best = apexes.max(axis=1)
             top = int(best.argmax())
             squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]

@@ -6,7 +6,7 @@
 The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row), and runs the
 further tests (`policy_pages.toml`) with the first seed. It writes `OUT/POLICY/CONDITION-SEED/metrics.json` after each
 row, and skips existing rows. Work can be interrupted, split by --policies and --conditions, and shared by processes.
-The second command saves these rows in the policies' folders. `policy_tables.py` makes the tables in docs/ from them.
+The second command saves these rows in the policies' folders, from which `docs/policy_tables.py` makes tables.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import read_values
+from jumper_warp.utils.progress import phase
 from support.policy_results import (
     COMBINED,
     CONDITIONS,
@@ -47,7 +48,7 @@ from support.policy_results import (
     tasks_of,
     undefined,
 )
-from support.scripts import ThreadArgs, announce, run_script, tracked
+from support.scripts import ThreadArgs, announce, run_script
 
 
 def with_trials(flags: Any, trials: int) -> Any:
@@ -181,14 +182,15 @@ def main(args: Args) -> int:
 def measure(args: Args) -> int:
     """Evaluate policies in all missing conditions, print the results, and return the number of evaluations."""
     rows = missing_rows(args)
-    for row in tracked(rows, "evaluations"):
-        values = measure_row(args, *row)
-        gc.collect()  # frees the device memory of the environment
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
-        announce(
-            f"{' '.join(map(str, row))}: {', '.join(f'{key} {values[key]:.4g}' for key in SHOWN if key in values)}"
-        )
+    with phase("evaluations", len(rows)) as advance:
+        for row in rows:
+            values = measure_row(args, *row)
+            gc.collect()  # frees the device memory of the environment
+            if torch.cuda.is_available():
+                torch.cuda.empty_cache()
+            shown = ", ".join(f"{key} {values[key]:.4g}" for key in SHOWN if key in values)
+            announce(f"{' '.join(map(str, row))}: {shown}")
+            advance()
     announce(f"{len(rows)} rows measured, in {args.out}; --save-to-policies saves them")
     return len(rows)
 

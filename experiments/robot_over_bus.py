@@ -179,14 +179,9 @@ def read_state(sim: Simulation, motion: Motion) -> None:
 
 
 def trajectory(rows: list) -> dict[str, np.ndarray]:
-    """Return the rows of a trajectory by name: position, quaternion, velocity."""
-    values = np.array(rows)
-    return {
-        "position": values[:, :3],
-        "quaternion": values[:, 3:7],
-        "velocity": values[:, 7:10],
-        "spin": values[:, 10:],
-    }
+    """Return the rows of a trajectory by name."""
+    names = ("position", "quaternion", "velocity", "spin")
+    return dict(zip(names, np.split(np.array(rows), [3, 7, 10], axis=1), strict=True))
 
 
 def fallen(run: dict[str, np.ndarray]) -> bool:

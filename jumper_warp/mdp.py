@@ -45,17 +45,9 @@ from jumper_warp.tasks.terms import (
     TerminationTerm,
 )
 
-__all__ = [
-    "FLIGHT", "LANDED", "STANCE", "Advance", "AttitudeState", "Command", "Curriculum", "EpisodeEvaluation",
-    "EpisodeMetric", "EventTerm", "Ground", "Handover", "JumpState", "NoSettings", "ObservationTerm",
-    "ObservationsCfg", "RandomizationCfg", "Reset", "RewardTerm", "RngStream", "RobotArrays", "RobotParameters",
-    "RobotView", "Scene", "SkillSettings", "StateMetric", "TaskCfg", "TerminationTerm", "VelocityState",
-    "clamped_normal", "commanded", "events", "fold_in", "in_flight", "jumping_motors", "mirror", "observations",
-    "rewards", "surface", "terminations", "tilt", "uniform", "uniform_range", "vec12", "vertical_jump_filter",
-    "waiting", "walking_filter", "walking_motors", "world_ground", "write_default_pose", "yaw_of",
-]  # fmt: skip
-
 for struct in (AttitudeState, Ground, JumpState, RobotArrays, RobotParameters, RobotView, Scene, VelocityState):
     source = inspect.getsource(struct.cls)
     fields = [": ".join(field) for field in re.findall(r"^    (\w+): .*?  # (.+)$", source, re.MULTILINE)]
     struct.__doc__ = "\n".join([inspect.getdoc(struct.cls) or "", "", *fields])
+
+del fields, inspect, re, source, struct  # all other names are for authors of tasks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,14 +12,12 @@ from typing import Any, TypeVar
 from jumper_warp.cli.main import parse, run_command
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.startup import prepare_imports
 from jumper_warp.utils.summary import PrintFlags, print_summary
 from support.timing import process_age
 
 Args = TypeVar("Args")
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -69,14 +67,6 @@ def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
 def announce(text: str) -> None:
     """Print what a script does or has done, with the time since its start, on standard error."""
     print(f"{process_age():4.0f} s  {text}", file=sys.stderr, flush=True)
-
-
-def tracked(items: Collection[Item], title: str) -> Iterator[Item]:
-    """Yield the items of a long loop; a terminal shows the progress and the time left."""
-    with phase(title, len(items)) as advance:
-        for item in items:
-            yield item
-            advance()
 
 
 def report(

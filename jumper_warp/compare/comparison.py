@@ -16,15 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jumper_warp.compare import statistics
 from jumper_warp.compare.arms import Arm, differences, find_arms, of_equal_length
-from jumper_warp.compare.statistics import (
-    bands,
-    holm,
-    interquartile_mean,
-    probability_interval,
-    probability_larger,
-    rank_test,
-)
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
@@ -83,7 +76,7 @@ class Comparison:
     def primary(self) -> list[Row]:
         """Primary metric of each arm, with the test of each against the base."""
         values = [self.values_of(arm, self.metric) for arm in range(len(self.arms))]
-        tests = holm([rank_test(values[0], other) for other in values[1:]])
+        tests = statistics.holm([statistics.rank_test(values[0], other) for other in values[1:]])
         rows = self._rows([self.metric], lambda arm, _: values[arm])
         return [row._replace(p_value=p) for row, p in zip(rows, [None, *tests], strict=True)]
 
@@ -126,11 +119,11 @@ class Comparison:
             for index, arm in enumerate(self.arms):
                 if not len(own := values(index, name)):
                     continue
-                low, high = bands(own)
+                low, high = statistics.bands(own)
                 better = (-own, -base) if self.primary_name == f"-{name}" else (own, base)
-                improvement = float(probability_larger(*better)) if index and len(base) else None
-                interval = None if improvement is None else probability_interval(*better)
-                mean = float(interquartile_mean(own))
+                improvement = float(statistics.probability_larger(*better)) if index and len(base) else None
+                interval = None if improvement is None else statistics.probability_interval(*better)
+                mean = float(statistics.interquartile_mean(own))
                 rows.append(Row(name, arm.name, own, mean, (float(low), float(high)), improvement, interval, None))
         return rows
 

@@ -14,14 +14,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
-from jumper_warp.envs.arrays import (
-    FIRST_STEP_COUNT,
-    checked_action,
-    checked_commands,
-    checked_mask,
-    checked_values,
-    checked_worlds,
-)
+from jumper_warp.envs import arrays
 from jumper_warp.envs.gradients import EnvGradients
 from jumper_warp.envs.stages import STAGES, Stages, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
@@ -197,7 +190,7 @@ class Env(Stages):
         Raises InputError (a ValueError): invalid seed or worlds, or both given. RuntimeError: worlds before the first
         reset of all.
         """
-        mask = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
+        mask = self._all if worlds is None else self._array(arrays.checked_worlds(worlds, self.num_envs))
         if worlds is not None and seed is not None:
             raise InputError("a seed resets all worlds: call reset(seed), or reset(worlds=...) without a seed")
         if worlds is not None and not self._started:
@@ -240,7 +233,7 @@ class Env(Stages):
         self.seed = self.episodes.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
-        for array, value in ((self.episodes.step_count, FIRST_STEP_COUNT), (self.episodes.requested_task, -1),
+        for array, value in ((self.episodes.step_count, arrays.FIRST_STEP_COUNT), (self.episodes.requested_task, -1),
                              (self.episodes.has_command, 0), (self.episodes.level, 0),
                              (self.episodes.streak, 0)):  # fmt: skip
             array.fill_(value)
@@ -283,7 +276,7 @@ class Env(Stages):
             raise RuntimeError("call reset before the first step")
         several = len(self.skills) > 1
         shape = (len(self.skills), self.num_envs, 12) if several else (self.num_envs, 12)
-        (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
+        (self.actions if several else self.action).copy_(arrays.checked_action(action, shape, self.device))
         if self.wp_device.is_cuda and torch.cuda.is_current_stream_capturing():
             locked(self._launch_step)()
         elif after_physics is None:
@@ -332,9 +325,9 @@ class Env(Stages):
         Raises InputError (a ValueError): values of another shape, out of bounds or, other than policy steps, infinite.
         """
         n = self.num_envs
-        chosen = checked_mask(worlds, self.num_envs)
-        values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
-        yaws = self._array(checked_values(headings, (n,), "headings"))
+        chosen = arrays.checked_mask(worlds, self.num_envs)
+        values = arrays.checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
+        yaws = self._array(arrays.checked_values(headings, (n,), "headings"))
         mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
@@ -360,8 +353,8 @@ class Env(Stages):
         commands: as in `evaluation_reset`, relative to the current base position and yaw; worlds: (num_envs,) bool, by
         default all. Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
         """
-        chosen = checked_mask(worlds, self.num_envs)
-        self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
+        chosen = arrays.checked_mask(worlds, self.num_envs)
+        self._set_commands(self._array(chosen), 0, arrays.checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), after_reset=1)
 
     @locked
@@ -373,10 +366,10 @@ class Env(Stages):
         Raises InputError (a ValueError): no such skill, or commands of another shape, out of bounds or not finite.
         """
         self._check_skill(skill)
-        mask = checked_mask(worlds, self.num_envs)
+        mask = arrays.checked_mask(worlds, self.num_envs)
         values = np.zeros((self.num_envs, 4), dtype=np.float32)
         if commands is not None:
-            values = checked_commands(commands, mask, [self.tasks[skill]])
+            values = arrays.checked_commands(commands, mask, [self.tasks[skill]])
         mask = mask > 0.0
         for array, new in ((self.episodes.requested_task, skill),
                            (self.episodes.has_command, int(commands is not None)),
@@ -400,10 +393,10 @@ class Env(Stages):
         """
         self._check_skill(skill)
         state = records(self.skills[skill].states)
-        arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
+        values = {name: np.array(state[name]) for name in state.dtype.names or ()}
         q, qd = self.sim.joint_q(), self.sim.joint_qd()
-        arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
-        return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in OF_EPISODE}
+        values |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
+        return values | {name: getattr(self.episodes, name).numpy().copy() for name in OF_EPISODE}
 
     @locked
     def snapshot(self) -> Snapshot:

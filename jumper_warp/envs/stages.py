@@ -13,14 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from jumper_warp.envs.arrays import (
-    FIRST_STEP_COUNT,
-    checked_skill,
-    delay_arrays,
-    episode_arrays,
-    robot_arrays,
-    scene_of,
-)
+from jumper_warp.envs import arrays
 from jumper_warp.envs.parameters import robot_parameters
 from jumper_warp.envs.skill import TaskRuntime, kernels_of
 from jumper_warp.kernels.mdp import attempts, events
@@ -94,16 +87,16 @@ class Stages(Uncopied):
         device = self.wp_device
         sim = self.sim
         wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
-        self._first_skill = checked_skill(skill, n, len(tasks))
+        self._first_skill = arrays.checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
         self.skills = [
             TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
         ]
         self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
-        self.robot = robot_arrays(sim, self.step_dt)
-        self._scene = scene_of(sim)
-        self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
-        self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
+        self.robot = arrays.robot_arrays(sim, self.step_dt)
+        self._scene = arrays.scene_of(sim)
+        self.episodes = arrays.episode_arrays(n, self.seed, self.stream, active, device)
+        self.delays = arrays.delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
             each.observations.latency = self.parameters.observation_latency
         settings = [each.settings_of_skill() for each in self.skills]
@@ -121,7 +114,7 @@ class Stages(Uncopied):
 
         Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
         """
-        self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
+        self._started = bool((self.episodes.step_count.numpy() > arrays.FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.dynamics.parameters_changed()
@@ -290,13 +283,13 @@ class Stages(Uncopied):
     def _observe(self, part: WorldSlice, after_reset: int) -> None:
         """Write observations; after_reset 1: only where an episode, skill or command just began, not `final_obs`."""
         for skill in self.skills:
-            arrays = skill.observations
+            observed = skill.observations
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
                 [skill.index, self.robot, self.parameters, self._scene.ground, part.episode, skill.states,
-                 skill.params.values, after_reset, skill.term_value, arrays.raw, skill.found, skill.found_states],
+                 skill.params.values, after_reset, skill.term_value, observed.raw, skill.found, skill.found_states],
             )  # fmt: skip
-            inputs = [skill.index, part.episode, skill.columns, skill.params.values, after_reset, arrays]
+            inputs = [skill.index, part.episode, skill.columns, skill.params.values, after_reset, observed]
             self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)
 
     def _launch(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
+from rich.table import Column, Table
 
 from jumper_warp.evaluation.commands import FilmCfg, open_viewer
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
@@ -17,6 +18,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, MetricValue
 from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.tables import print_table
 
 if TYPE_CHECKING:
     import torch
@@ -50,22 +52,17 @@ class AgentCfg:
             raise InputError(f"needs a robot and 0.02 to 600 s, got {self.num_envs} and {self.seconds:g}")
 
 
+@dataclass
 class AgentLog(EvaluationLog):
     """Log of the reward terms and terminations of all worlds, whose episodes begin in sampled states."""
 
+    task: TaskCfg
+    count: int  # Number of worlds
+    seconds: float = 10.0  # [s] Simulated time
+    _rewards: list[np.ndarray] = field(default_factory=list, init=False)
+    _endings: list[np.ndarray] = field(default_factory=list, init=False)
     row_name = "robot"
     spacing = 2.0
-
-    def __init__(self, task: TaskCfg, count: int, seconds: float) -> None:
-        """Prepare an empty log of `count` worlds and a simulated time [s]."""
-        self.task, self.count, self._seconds = task, count, seconds
-        self._rewards: list[np.ndarray] = []
-        self._endings: list[np.ndarray] = []
-
-    @property
-    def seconds(self) -> float:
-        """Simulated time [s]."""
-        return self._seconds
 
     def begin(self, env: Env) -> None:
         """Reset every world to a start state of training."""
@@ -176,10 +173,6 @@ def play_agent(task: TaskCfg, cfg: AgentCfg) -> Path:
 
 def print_gradients(check: GradientCheck) -> None:
     """Print a table of the gradients of the reward terms, and what is wrong with them."""
-    from rich.table import Column, Table
-
-    from jumper_warp.utils.tables import print_table
-
     table = Table(Column("gradient of the reward", no_wrap=True), "not zero", "at a kink", "fault", box=None)
     faults = check.faults()
     kinks = check.kinks()
@@ -202,10 +195,6 @@ def agent_metrics(log: AgentLog) -> Metrics:
 
 def print_statistics(log: AgentLog) -> None:
     """Print a table of the reward terms and one of the terminations."""
-    from rich.table import Column, Table
-
-    from jumper_warp.utils.tables import print_table
-
     table = Table(Column("reward, per step", no_wrap=True), "smallest", "largest", "mean", "not zero", box=None)
     for name, values in log.rewards.items():
         numbers = (f"{value + 0.0:.3g}" for value in (values.min(), values.max(), values.mean()))

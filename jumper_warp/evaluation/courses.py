@@ -15,20 +15,12 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.jumps import updated_apex
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, listed
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.evaluation.trained import warn_beyond_training
-from jumper_warp.evaluation.velocities import (
-    AXES,
-    SETTLING_TIME,
-    SLEW_RATE,
-    UNITS,
-    body_velocity,
-    square_sums,
-    velocity_series,
-)
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.switching import FALLS
@@ -167,7 +159,7 @@ class CourseLog(EvaluationLog):
         waits = running & jumping & (self._skill == WALK) & (waited >= NUDGE_AFTER)
         nudged = np.where((np.mod(waited, NUDGE_AFTER) < NUDGE_TIME)[:, None], NUDGE, 0.0)
         self._target_velocity[waits] = nudged[waits]
-        step = SLEW_RATE * self.step_dt
+        step = velocities.SLEW_RATE * self.step_dt
         command = self._command + np.clip(self._target_velocity - self._command, -step, step)
         command[self._skill != WALK] = 0.0
         changed = (self._skill == WALK) & ((command != self._command).any(axis=1) | (previous != WALK))
@@ -254,9 +246,9 @@ class CourseLog(EvaluationLog):
         at = self._at
         alive = running[:, None]
         walking = (previous == WALK)[:, None]
-        self.velocity.append(np.where(alive, body_velocity(arrays), np.nan).astype(np.float32))
+        self.velocity.append(np.where(alive, velocities.body_velocity(arrays), np.nan).astype(np.float32))
         self.commands.append(np.where(alive & walking, self._command, np.nan).astype(np.float32))
-        settled = step - self.start_step[rows, at] > round(SETTLING_TIME / self.step_dt)
+        settled = step - self.start_step[rows, at] > round(velocities.SETTLING_TIME / self.step_dt)
         self.is_tracked.append(running & walking[:, 0] & settled & (self.target_skill[rows, at] == WALK))
         self.skills.append(previous.copy())
         self.height.append(arrays["base_pos"][:, 2].copy())
@@ -300,7 +292,7 @@ class CourseLog(EvaluationLog):
 
     def series(self) -> dict[str, np.ndarray]:
         """Return values to plot: the current velocity, command and base height [m] of all robots."""
-        series = velocity_series(self.velocity[-1], self.marks()["commands"])
+        series = velocities.velocity_series(self.velocity[-1], self.marks()["commands"])
         return series | {"height/base, {} [m]": self.height[-1]}
 
     def states(self) -> dict[str, np.ndarray]:
@@ -336,7 +328,7 @@ def course_metrics(course: CourseLog) -> Metrics:
     finished = course.outcomes == "done"
     error = np.array(course.velocity, dtype=float) - np.array(course.commands, dtype=float)
     error[~np.array(course.is_tracked)] = np.nan
-    squares = square_sums(error)
+    squares = velocities.square_sums(error)
     metrics = {
         "finished_rate": rate(finished, "robots"),
         "finished_on_goal_rate": rate(finished & course.on_goal.all(axis=1), "robots"),
@@ -349,7 +341,7 @@ def course_metrics(course: CourseLog) -> Metrics:
         "goal_distance_at_handover_mean_m": mean(course.landing_error, "finished jumps to places"),
         "goal_distance_at_handover_max_m": largest(course.landing_error, "finished jumps to places"),
     }
-    for i, (axis, unit) in enumerate(zip(AXES, UNITS, strict=True)):
+    for i, (axis, unit) in enumerate(zip(velocities.AXES, velocities.UNITS, strict=True)):
         metrics[f"settled_slewed_rmse_{axis}_{unit}"] = rmse(squares[:, i], "robots")
     ripple, step = handover_forces(course)
     takeoff, switch = (course.step_dt * (s - course.start_step) for s in (course.takeoff_step, course.switch_step))

@@ -50,6 +50,7 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     """
     rng = np.random.default_rng(purpose_seed("tuning", cfg.seed))
     groups = []
+    shared: Json = {"seed": cfg.seed, "stream": "tuning", "device": cfg.device, "threads": cfg.threads}
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
         """Return the task as evaluations use it, without platforms and blocks."""
@@ -69,14 +70,7 @@ def make_groups(recipe: Recipe, cfg: FinetuneCfg) -> list[JumpGroup]:
     )
     for name, count, std, randomize, change_task in kinds:
         if count:
-            conditions = Conditions(
-                randomize=randomize,
-                noise=name == "randomized",
-                seed=cfg.seed,
-                stream="tuning",
-                device=cfg.device,
-                threads=cfg.threads,
-            )
+            conditions = Conditions(randomize=randomize, noise=name == "randomized", **shared)
             robot = conditions.overlay(recipe.robot)
             if robot is not None and name == "late":
                 own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}

@@ -16,12 +16,8 @@ if TYPE_CHECKING:
 
 PER_WORLD = ("joint_q", "joint_qd", "body_com", "gravity", "diverged", "prev_lin_vel")
 """Names of the arrays of `RobotArrays` whose first axis runs over worlds; other arrays have worlds on the second."""
-SKIPPED = (
-    "body_f",
-    "impulse",
-    "default_angle",
-    "step_dt",
-)  # Members of `RobotArrays` that terms do not read, or constant
+SKIPPED = ("body_f", "impulse", "default_angle", "step_dt")
+"""Members of `RobotArrays` that terms do not read, or constant."""
 ROBOT, STATE, TERMINATION = "robot.", "state.", "termination"  # Begins of the keys, and key of the termination's index
 ROBOT_STATES = tuple(ROBOT + name for name in RobotArrays.vars if name not in SKIPPED)  # Keys of the robot's arrays
 

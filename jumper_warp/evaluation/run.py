@@ -9,7 +9,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -70,16 +70,10 @@ class EvaluationArgs(Conditions, PrintFlags):
 
     def __post_init__(self) -> None:
         """Raise InputError for invalid conditions, numbers of threads or of recorded worlds."""
+        object.__setattr__(self, "noise", self.randomize)
         super().__post_init__()
         check(self.num_recorded >= 0, f"num_recorded must not be negative, got {self.num_recorded}")
         checked_threads(self.threads)
-
-
-def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the test conditions from an experiment's flags; randomised robots have observation noise."""
-    values: Json = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
-    values["noise"] = args.randomize
-    return Conditions(**values)
 
 
 class Run(ABC):
@@ -110,7 +104,7 @@ class Run(ABC):
 
         name: of the output folder, see `prepare`.
         """
-        self.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        self.prepare(name, args, args.out, record=args.num_recorded, save_trials=args.save_trials)
         self.print_flags = args
         return self
 

@@ -375,12 +375,8 @@ def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     bins: logs by distance at the bin's middle [m], ascending.
     """
     outcomes = [landings.outcome for landings in bins.values()]
-    together = JumpOutcome(
-        **{
-            name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
-            for name in (field.name for field in fields(JumpOutcome))
-        }
-    )
+    names = [field.name for field in fields(JumpOutcome)]
+    together = JumpOutcome(**{name: np.concatenate([getattr(o, name) for o in outcomes]) for name in names})
     goals = np.concatenate([landings.goals for landings in bins.values()])
     inside = within(goals[..., 0], IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
+from jumper_warp.identification import results
 from jumper_warp.identification.consistency import contradictions, residual_tests, without
 from jumper_warp.identification.least_squares import (
     FRICTION,
@@ -29,15 +30,6 @@ from jumper_warp.identification.motions import NoiseLevels, RecordedMotion, chec
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import Linearised, MotionResiduals, pieces_of
-from jumper_warp.identification.results import (
-    DescentStep,
-    Effort,
-    Identification,
-    Minimum,
-    excess_costs,
-    starts_agree,
-    summarise,
-)
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.progress import phase
@@ -68,7 +60,7 @@ def identify(
     replay: MotionReplay | None = None,
     device: wp.DeviceLike = None,
     threads: int | None = None,
-) -> Identification:
+) -> results.Identification:
     """Identify the robot's parameters from recorded motions by least squares (Levenberg-Marquardt).
 
     prior_measurements: such as a weighed mass. dt [s]: largest physics step, by default 1/480. replay: simulation to
@@ -95,7 +87,7 @@ def identify(
     with phase("identifying parameters", stages) as advance:
         descent = Descent(replay, advance)
         problem, minima = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
-    return summarise(problem, minima, descent.steps, descent.effort)
+    return results.summarise(problem, minima, descent.steps, descent.effort)
 
 
 class Descent:
@@ -112,16 +104,16 @@ class Descent:
         self.advance = advance
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
-    def effort(self) -> Effort:
+    def effort(self) -> results.Effort:
         """Return wall time, CPU time and physics steps that the optimisation has taken so far."""
         seconds, cpu, steps = self._begin
-        return Effort(time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps)
+        return results.Effort(time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps)
 
     def record_step(self, problem: LeastSquares, trial: Trial) -> None:
         """Append the result of a Levenberg-Marquardt step to the log `steps`."""
         chi2 = trial.cost / problem.count
         effort = self.effort()
-        self.steps.append(DescentStep(self.stage, chi2, trial.damping, effort.world_steps, effort.seconds))
+        self.steps.append(results.DescentStep(self.stage, chi2, trial.damping, effort.world_steps, effort.seconds))
 
     def minimise(
         self, problem: LeastSquares, point: Point, normal: NormalEquations, decrease: float | None = None
@@ -151,7 +143,7 @@ class Descent:
         self.advance()
         return point, normal
 
-    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> Minimum:
+    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> results.Minimum:
         """Find the local minimum near a point; if another paw friction lowers the cost, find the minimum from there.
 
         normal: the normal equations at the point.
@@ -163,7 +155,7 @@ class Descent:
             best = int(np.argmin(costs))
             if costs[best] < normal.cost - CONVERGED * problem.scale(normal):
                 point, normal = self.minimise(problem, moved[best], problem.normal(moved[best]))
-        return Minimum(point, normal)
+        return results.Minimum(point, normal)
 
 
 def descend(
@@ -173,7 +165,7 @@ def descend(
     whole: Sequence[MotionResiduals],
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
-) -> tuple[LeastSquares, list[Minimum]]:
+) -> tuple[LeastSquares, list[results.Minimum]]:
     """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starting points.
 
     Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
@@ -204,7 +196,8 @@ def descend(
             best, normal = minima[0]
             fits = all(test.passed for test in residual_tests(final, normal))
             failed = contradictions(final, normal)
-            if (starts_agree(excess_costs(final, minima)) and not failed) or (len(minima) > 1 and not fits):
+            agree = results.starts_agree(results.excess_costs(final, minima))
+            if (agree and not failed) or (len(minima) > 1 and not fits):
                 break
             untried = [sensor for sensor in failed if (sensor.motion, sensor.name) not in left_out]
             direct = fits and (bool(untried) or found_direct or len(minima) == MAX_STARTS - 1)
@@ -226,7 +219,7 @@ def descend(
         if not minima or normal.cost < minima[0].normal.cost:
             found_direct = direct
             normal = final.without_jumps(point, normal)
-        minima.append(Minimum(point, normal))
+        minima.append(results.Minimum(point, normal))
         minima.sort(key=lambda minimum: minimum.normal.cost)
     return final, minima
 

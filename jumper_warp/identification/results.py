@@ -9,17 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jumper_warp.identification import uncertainty
 from jumper_warp.identification.consistency import FitTest, parameter_tests, residual_tests
 from jumper_warp.identification.least_squares import FRICTION, FRICTION_MOVES, LeastSquares, NormalEquations, Point
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.identification.uncertainty import (
-    Direction,
-    mismatch_factor,
-    systematic_std,
-    trapped_variance,
-    weak_directions,
-)
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 
@@ -112,7 +106,7 @@ class Identification:
     nominal_chi2: float  # [1] χ² of the described robot at the nominal initial states
     count: int  # number of measured values
     fits: tuple[Fit, ...]  # fit of each channel of each motion
-    directions: tuple[Direction, ...]  # combinations of parameters that the data does not determine
+    directions: tuple[uncertainty.Direction, ...]  # combinations of parameters that the data does not determine
     steps: tuple[DescentStep, ...]
     dt: float  # [s] Physics step
     effort: Effort
@@ -235,7 +229,7 @@ def trapped_spread(problem: LeastSquares, minimum: Minimum, covariance: np.ndarr
     points, costs = problem.scan(point, normal, index, FRICTION_MOVES)
     moves = np.array([moved.z[index] - point.z[index] for moved in points])
     variance = covariance[index, index]
-    missed = trapped_variance(moves, (costs - normal.cost) / problem.scale(normal), math.sqrt(variance))
+    missed = uncertainty.trapped_variance(moves, (costs - normal.cost) / problem.scale(normal), math.sqrt(variance))
     return math.sqrt(missed) * np.abs(covariance[:, index]) / variance
 
 
@@ -260,9 +254,9 @@ def summarise(
         table[motion.valid] = residual
         tables.append(table)
     covariance = np.linalg.inv(information + np.eye(len(information)))
-    mismatch = mismatch_factor(tables)
+    mismatch = uncertainty.mismatch_factor(tables)
     columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
-    systematic = systematic_std(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
+    systematic = uncertainty.systematic_std(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
     excess = excess_costs(problem, minima)
     distance = np.array([minimum.point.z - point.z for minimum in minima])
     weight = np.exp(-0.5 * excess) / np.sum(np.exp(-0.5 * excess))
@@ -279,7 +273,7 @@ def summarise(
         nominal_chi2=sum(error.cost for error in nominal) / problem.count,
         count=problem.count,
         fits=tuple(fits),
-        directions=weak_directions(problem.parameters, information),
+        directions=uncertainty.weak_directions(problem.parameters, information),
         steps=tuple(steps),
         dt=max(motion.dt for motion in problem.motions),
         effort=effort(),

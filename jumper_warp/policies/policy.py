@@ -20,22 +20,7 @@ import torch
 from torch import nn
 
 from jumper_warp.envs.vec_env import RAW_LIMIT
-from jumper_warp.policies.catalog import (
-    CONFIG,
-    MANIFEST,
-    ONNX,
-    README,
-    RSL_RL,
-    SCHEMA_VERSION,
-    check_version,
-    find_policy,
-    is_run,
-    newest_run,
-    parse_object,
-    read_files,
-    run_folder,
-    write_files,
-)
+from jumper_warp.policies import catalog
 from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_onnx
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, checksum_entry, make_interface
 from jumper_warp.recipe import Recipe
@@ -129,16 +114,16 @@ class Policy(nn.Module):
         rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
         Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
         """
-        source = newest_run(source)
-        if is_run(source):
+        source = catalog.newest_run(source)
+        if catalog.is_run(source):
             return _policy_of_run(Path(source), newest)
-        folder = find_policy(source)
-        files = read_files(folder)
-        config = parse_object(folder / CONFIG, files[CONFIG])
-        check_version(folder / CONFIG, config)
+        folder = catalog.find_policy(source)
+        files = catalog.read_files(folder)
+        config = catalog.parse_object(folder / catalog.CONFIG, files[catalog.CONFIG])
+        catalog.check_version(folder / catalog.CONFIG, config)
         try:
             spec = PolicyInterface.from_json(config.get("interface"))
-            tensors = tensors_from_onnx(files[ONNX], spec, config)
+            tensors = tensors_from_onnx(files[catalog.ONNX], spec, config)
         except PolicyError as error:
             raise PolicyError(f"{folder}: {error}") from error
         layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(spec.sizes) - 1)]
@@ -212,13 +197,15 @@ def _named(layers: Weights, mean: torch.Tensor, std: torch.Tensor) -> dict[str, 
 
 def _policy_of_run(source: Path, newest: bool) -> Policy:
     """Load the policy of a checkpoint or of a run's folder; arguments and errors: see `Policy.load`."""
-    foreign = {int(match[1]): path for path in source.glob("model_*.pt") if (match := RSL_RL.fullmatch(path.name))}
+    foreign = {
+        int(match[1]): path for path in source.glob("model_*.pt") if (match := catalog.RSL_RL.fullmatch(path.name))
+    }
     path = foreign[max(foreign)] if foreign else source
     read = _policy_of_checkpoint
-    if RSL_RL.fullmatch(path.name):
-        file = path.with_name(CONFIG)
+    if catalog.RSL_RL.fullmatch(path.name):
+        file = path.with_name(catalog.CONFIG)
         if not file.exists():
-            raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config")
+            raise CheckpointError(f"{path}: needs {catalog.CONFIG} beside it, see RslRlVecEnv.write_config")
         config = read_json(file, "settings of a run", error=CheckpointError)
         state = {"config": config, "saved": checkpoints.load_foreign_checkpoint(path)}
         read = _policy_of_rsl_rl
@@ -305,7 +292,7 @@ def _actor_layers(model: Json, prefix: str) -> Weights:
 
 def learning_curve(source: Path) -> bytes | None:
     """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
-    path = run_folder(source) / METRICS_FILE
+    path = catalog.run_folder(source) / METRICS_FILE
     return thinned_curve(read_file(path, "metrics of a run")) if path.is_file() else None
 
 
@@ -339,19 +326,19 @@ def save_policy(
     check_type("policy", policy, Policy)
     folder = checked_folder(folder, overwrite)
     config = {**source_versions(), **policy.config}
-    config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
+    config |= {"schema_version": catalog.SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
         **(files or {}),
-        CONFIG: json_bytes(config),
-        ONNX: onnx_bytes(policy.tensors(), policy.interface, config),
-        README: default_readme(policy.interface).encode(),
+        catalog.CONFIG: json_bytes(config),
+        catalog.ONNX: onnx_bytes(policy.tensors(), policy.interface, config),
+        catalog.README: default_readme(policy.interface).encode(),
     }
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as aside:
         new = Path(aside, "new")
         old = Path(aside, "old")
         new.mkdir()
-        write_files(new, content, {})
+        catalog.write_files(new, content, {})
         with directory_lock(folder.parent):
             try:
                 if folder.exists():
@@ -374,7 +361,7 @@ def checked_folder(folder: Path, overwrite: bool) -> Path:
         raise PolicyError(f"a policy's folder needs a name, got {folder}")
     if folder.suffix.lower() in FILE_SUFFIXES:
         raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
-    if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
+    if folder.exists() and not (overwrite and (folder / catalog.MANIFEST).is_file()):
         reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
         raise PolicyError(f"{folder} exists{reason}")
     return folder
@@ -385,7 +372,7 @@ def default_readme(spec: PolicyInterface) -> str:
     return (
         f"# Policy for {spec.task}\n\n"
         f"Reads {spec.sizes[0]} numbers, drives {spec.sizes[-1]} motors at {1.0 / spec.policy_dt:.0f} Hz.\n"
-        f"`{ONNX}` holds the network with its normaliser, `{CONFIG}` everything that made it.\n\n"
+        f"`{catalog.ONNX}` holds the network with its normaliser, `{catalog.CONFIG}` everything that made it.\n\n"
         "    jumper play FOLDER\n"
         "    jumper evaluate FOLDER\n"
     )

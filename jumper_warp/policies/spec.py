@@ -8,15 +8,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from jumper_warp.utils.checks import (
-    ACTIVATIONS,
-    MAX_HIDDEN,
-    MAX_WIDTH,
-    NAME,
-    check_angle_limits,
-    check_filter_speed,
-    check_types,
-)
+from jumper_warp.utils.checks import NAME, check_angle_limits, check_filter_speed, check_network, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
 
@@ -93,13 +85,9 @@ class PolicyInterface:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
         if self.physics_dt > self.policy_dt:
             raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
-        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
-            sizes = f"1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}"
-            raise PolicyError(f"hidden must name {sizes}, got {self.hidden!s:.100}")
+        check_network(self.hidden, self.activation, PolicyError)
         _check_filter(self.command_filter)
         _check_layout(self.observation_layout, len(self.observation_names))
-        if self.activation not in ACTIVATIONS:
-            raise PolicyError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r:.40}")
         if self.quaternion_order != "xyzw":
             raise PolicyError(f"quaternion_order must be xyzw, got {self.quaternion_order!r:.40}")
 

@@ -6,17 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from jumper_warp.utils.checks import (
-    ACTIVATIONS,
-    MAX_HIDDEN,
-    MAX_WIDTH,
-    NAME,
-    check_bounds,
-    check_count,
-    check_not_negative,
-    check_seed,
-    check_types,
-)
+from jumper_warp.utils import checks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
@@ -97,15 +87,11 @@ class PpoCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of PPO is of another type or out of range."""
         object.__setattr__(self, "hidden", tuple(self.hidden) if isinstance(self.hidden, list) else self.hidden)
-        check_types("ppo", self)
-        check_bounds("ppo", self, PPO_BOUNDS)
+        checks.check_types("ppo", self)
+        checks.check_bounds("ppo", self, PPO_BOUNDS)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
-        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
-            widths = f"1 to {MAX_HIDDEN} widths of 1 to {MAX_WIDTH}"
-            raise InputError(f"hidden must name {widths}, got {self.hidden!s:.60}")
-        if self.activation not in ACTIVATIONS:
-            raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
+        checks.check_network(self.hidden, self.activation)
 
     def batch_size(self, num_envs: int) -> int:
         """Return the number of samples that an iteration collects in num_envs worlds, num_steps · num_envs.
@@ -180,18 +166,18 @@ class TrainCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
-        check_types("training:", self)
-        object.__setattr__(self, "num_envs", check_count("num_envs", self.num_envs))
+        checks.check_types("training:", self)
+        object.__setattr__(self, "num_envs", checks.check_count("num_envs", self.num_envs))
         for name in ("max_iterations", "log_interval", "save_interval", "max_checkpoints"):
-            object.__setattr__(self, name, check_count(name, getattr(self, name), MOST_ITERATIONS))
-        check_not_negative("max_seconds", self.max_seconds)
+            object.__setattr__(self, name, checks.check_count(name, getattr(self, name), MOST_ITERATIONS))
+        checks.check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
-        object.__setattr__(self, "seed", check_seed(self.seed))
-        object.__setattr__(self, "seeds", tuple(check_seed(seed) for seed in self.seeds))
+        object.__setattr__(self, "seed", checks.check_seed(self.seed))
+        object.__setattr__(self, "seeds", tuple(checks.check_seed(seed) for seed in self.seeds))
         if len(set(self.seeds)) < len(self.seeds):
             raise InputError(f"seeds must be distinct, got {self.seeds}")
         for name in (self.task, self.run_name, *self.tags):
-            if name is not None and not NAME.fullmatch(name):
+            if name is not None and not checks.NAME.fullmatch(name):
                 allowed = "letters, digits, _ . - and spaces"
                 raise InputError(f"task, run_name and tags may contain {allowed}, got {name!r:.60}")
         for name in ("resume", "init_policy"):

@@ -10,16 +10,8 @@ from collections.abc import Iterable
 from typing import Any
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
+from jumper_warp.robot import model
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription
-from jumper_warp.robot.model import (
-    CONTACT_DAMPING,
-    CONTACT_IMPEDANCE,
-    CONTACT_STIFFNESS,
-    GROUND_COLOR,
-    LOOP_IMPEDANCE,
-    PHYSICS_DT,
-    standing_configuration,
-)
 from jumper_warp.robot.parts import Link, Shape, mesh_files
 from jumper_warp.robot.values import RobotValues, described
 
@@ -45,7 +37,7 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
     root.append(Comment(ABOUT.format(name=robot.name)))
     add(root, "compiler", angle="radian", meshdir="meshes", autolimits="true")
     # Euler applies the motors' damping explicitly, as this project does on SolverMuJoCo
-    add(root, "option", timestep=PHYSICS_DT, integrator="Euler", cone="pyramidal")
+    add(root, "option", timestep=model.PHYSICS_DT, integrator="Euler", cone="pyramidal")
     add(root, "statistic", center=(0, 0, 0.3), extent=0.8)  # [m], for viewers
     _add_defaults(root, values.paw_friction[0, 0])
     _add_assets(root, robot)
@@ -54,7 +46,7 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
     equality = add(root, "equality")
     for loop in robot.loops:
         add(equality, "connect", name=loop.name, site1=f"{loop.name}_parent", site2=f"{loop.name}_child",
-            solref=(STIFFEST, 1), solimp=LOOP_IMPEDANCE)  # fmt: skip
+            solref=(STIFFEST, 1), solimp=model.LOOP_IMPEDANCE)  # fmt: skip
     _add_actuators(root, robot)
     _add_keyframe(root, robot)
     indent(root)
@@ -87,8 +79,8 @@ def _add_defaults(root: Element, paw_friction: float) -> None:
     add(visual, "geom", contype="0", conaffinity="0", group="2", mass=0)
     paw = add(defaults, "default", class_="paw")
     # with priority, the paw's friction and softness hold on every ground, and paws do not collide with each other
-    ratio = 0.5 * CONTACT_DAMPING / CONTACT_STIFFNESS**0.5
-    softness = {"solref": (2.0 / CONTACT_DAMPING, ratio), "solimp": CONTACT_IMPEDANCE}
+    ratio = 0.5 * model.CONTACT_DAMPING / model.CONTACT_STIFFNESS**0.5
+    softness = {"solref": (2.0 / model.CONTACT_DAMPING, ratio), "solimp": model.CONTACT_IMPEDANCE}
     add(paw, "geom", contype="1", conaffinity="0", priority="1", condim="3", group="3",
         friction=(paw_friction, 0.005, 0.0001), **softness)  # fmt: skip
 
@@ -98,9 +90,9 @@ def _add_assets(root: Element, robot: RobotDescription) -> None:
     assets = add(root, "asset")
     for file in sorted(mesh_files(robot)):
         add(assets, "mesh", name=file.stem, file=file.name)
-    darker = [0.8 * value for value in GROUND_COLOR]
-    add(assets, "texture", name="ground", type="2d", builtin="checker", width="256", height="256", rgb1=GROUND_COLOR,
-        rgb2=darker)  # fmt: skip
+    darker = [0.8 * value for value in model.GROUND_COLOR]
+    add(assets, "texture", name="ground", type="2d", builtin="checker", width="256", height="256",
+        rgb1=model.GROUND_COLOR, rgb2=darker)  # fmt: skip
     add(assets, "material", name="ground", texture="ground", texrepeat=(2, 2), texuniform="true")
 
 
@@ -112,7 +104,7 @@ def _add_world(root: Element, robot: RobotDescription) -> None:
         material="ground")  # fmt: skip
     motors = dict(zip(MOTOR_JOINTS, robot.motors, strict=True))
     links = {link.name: link for link in robot.links}
-    height = float(standing_configuration(robot)[2])
+    height = float(model.standing_configuration(robot)[2])
     bodies = {"body": add(world, "body", name="body", pos=(0, 0, height))}
     add(bodies["body"], "freejoint", name="base")
     _add_shapes(bodies["body"], links["body"])
@@ -189,7 +181,7 @@ def _add_actuators(root: Element, robot: RobotDescription) -> None:
 
 def _add_keyframe(root: Element, robot: RobotDescription) -> None:
     """Add the standing default pose as a keyframe, its motor angles as targets."""
-    q = standing_configuration(robot)
+    q = model.standing_configuration(robot)
     knees = [0.0] * (len(robot.joints) - len(robot.motors))
     add(add(root, "keyframe"), "key", name="default", qpos=(*q[:3], q[6], *q[3:6], *q[7:27]),
         ctrl=(*robot.pose("default"), *knees))  # fmt: skip

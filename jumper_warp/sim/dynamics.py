@@ -132,12 +132,12 @@ class JumperDynamics:
         self.paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
         self.ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
-        """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
+        """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack` after a change."""
         springs = np.array([robots[world % len(robots)].spring for world in range(self.num_worlds)], dtype=np.float32)
         self.leg_springs = wp.array(springs, dtype=wp.vec2, device=self.device)
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between knees, vec2 of shape (num_worlds,).
 
-        Call `pack_springs` after a change."""
+        Call `pack` after a change."""
 
         self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(robots, self.modules.geometry, self.device)
@@ -148,6 +148,7 @@ class JumperDynamics:
         self.robot.held = wp.zeros(0, dtype=int, device=self.device)
         self.work = self._workspace()
         self._momenta = self.momenta() if keep_momentum else None
+        self._every_world = wp.ones(self.num_worlds, dtype=float, device=self.device)  # mask
         self.pack()
 
     def _workspace(self) -> KernelStruct:
@@ -184,39 +185,17 @@ class JumperDynamics:
     def pack(self) -> None:
         """Copy masses, joints, friction, gravity and knee springs from the model to the kernels' parameter table.
 
-        The table has a row of all worlds for each parameter, in the kernels' precision. A change of the model's arrays
-        has no effect until it is copied.
+        The table has a row of all worlds for each parameter, in the kernels' precision. A change of the model's
+        arrays, of `static_friction_ratio` or of `leg_springs` has no effect until it is copied.
         """
-        self.pack_masses()
-        self.pack_joints()
-        self.pack_friction()
-        self.pack_gravity()
-        self.pack_springs()
-
-    def pack_masses(self) -> None:
-        """Copy masses, centres of mass and inertias of all links from the model to the parameter table."""
+        self.repack(self._every_world)
         m = self.model
-        arrays = [m.body_mass, m.body_com, m.body_inertia]
-        self._launch(self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), arrays)
-
-    def pack_joints(self) -> None:
-        """Copy armature, friction, damping and hard stops of all joints from the model to the parameter table."""
-        m = self.model
-        lower, upper = self.description.transversal_sum
         self._launch(
-            self.modules.parameters.pack_joints_kernel,
+            self.modules.parameters.pack_constants_kernel,
             (self.num_worlds, 4),
-            [m.joint_armature, m.joint_friction, m.joint_damping, m.joint_limit_lower, m.joint_limit_upper,
-             m.joint_limit_ke, m.joint_limit_kd, m.joint_effort_limit, lower, upper],
+            [m.joint_damping, m.joint_limit_lower, m.joint_limit_upper, m.joint_limit_ke, m.joint_limit_kd,
+             m.joint_effort_limit, *self.description.transversal_sum, self.leg_springs, m.gravity],
         )  # fmt: skip
-
-    def pack_friction(self) -> None:
-        """Copy friction coefficients of paws and ground, and `static_friction_ratio`, to the parameter table."""
-        self._launch(
-            self.modules.parameters.pack_friction_kernel,
-            (self.num_worlds, 4),
-            [self.paws, self.ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
-        )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
         """Update masses, armature and friction of some worlds in the kernels' parameter table, from the model.
@@ -244,14 +223,6 @@ class JumperDynamics:
         else:
             self.repack(mask, worlds)
 
-    def pack_gravity(self) -> None:
-        """Copy gravity of every world from the model to the parameter table of the kernels."""
-        self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
-
-    def pack_springs(self) -> None:
-        """Copy stiffness and rest length of the springs between knees to the parameter table of the kernels."""
-        self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
-
     def set_springs(self, stiffness: np.ndarray, length: np.ndarray) -> None:
         """Set the springs between the knees of each leg: stiffness [N/m] and rest length [m].
 
@@ -259,7 +230,7 @@ class JumperDynamics:
         """
         values = np.hstack([stiffness, length])
         self.leg_springs.assign(np.broadcast_to(values, (self.num_worlds, 2)).astype(np.float32))
-        self.pack_springs()
+        self.pack()
 
     def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         """Launch a kernel that writes to the table of robot parameters."""

@@ -13,7 +13,6 @@ from jumper_warp.kernels.actuation.motors import motor_torque_kernel
 from jumper_warp.kernels.actuation.passive import passive_torque_kernel
 from jumper_warp.kernels.actuation.readout import arrived_target_kernel, motor_values_kernel, paw_force_kernel
 from jumper_warp.kernels.dynamics.restore import mask_kernel, zero_worlds_kernel
-from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
 from jumper_warp.robot.model import KNEE_DOFS, LOOP_IMPEDANCE, PAWS, PHYSICS_DT, other_colliders
 from jumper_warp.sim.dynamics import TOLERANCE, JumperDynamics, WorldRange
@@ -149,7 +148,7 @@ class MujocoDynamics(JumperDynamics):
         joint_f = self._control.joint_f
         work = self.work
         each_motor = (12, self.num_worlds)
-        self._launch_on(motor_torque_kernel, each_motor, [target, q, qd, COORDS, DOFS, motors], [joint_f])
+        self._launch_on(motor_torque_kernel, each_motor, [target, q, qd, motors], [joint_f])
         self._launch_on(motor_values_kernel, each_motor, [joint_f], [work.torque])
         self._launch_on(passive_torque_kernel, (self.num_worlds, 4), [q, qd, *self._passive], [joint_f])
         self.solver.step(state, state, self._control, self._contacts, dt, observables=self._observables)

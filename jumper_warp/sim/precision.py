@@ -54,7 +54,6 @@ class KernelModules:
             multipliers,
             rollout_adjoint,
             rollout_legs_adjoint,
-            step_adjoint,
         )
         from jumper_warp.kernels.dynamics.legs import advance_legs, rollout_legs
         from jumper_warp.kernels.dynamics.world import advance, rollout

@@ -14,7 +14,6 @@ import warp as wp
 from jumper_warp.kernels.actuation.command_filter import command_filter_kernel
 from jumper_warp.kernels.actuation.readout import base_velocity_kernel
 from jumper_warp.kernels.dynamics.restore import restore_motors_kernel
-from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.grounds import BlockCfg
@@ -353,7 +352,7 @@ class Simulation(Uncopied):
         self._launch(
             command_filter_kernel,
             (4, worlds.count),
-            [worlds.first, self.target, self.state.joint_q, self.state.joint_qd, COORDS, DOFS, self.motors.offset,
+            [worlds.first, self.target, self.state.joint_q, self.state.joint_qd, self.motors.offset,
              self._filter],
             [self._safe_target],
         )  # fmt: skip

@@ -266,19 +266,8 @@ class SolverJumper(SolverBase):
 
     @locked
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
-        """Update the solver after parameters of the model, named by `flags`, have changed."""
-        if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
-            self.dynamics.pack_masses()
-        if flags & (
-            ModelFlags.JOINT_DOF_PROPERTIES
-            | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
-            | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
-        ):
-            self.dynamics.pack_joints()
-        if flags & ModelFlags.SHAPE_PROPERTIES:
-            self.dynamics.pack_friction()
-        if flags & ModelFlags.MODEL_PROPERTIES:
-            self.dynamics.pack_gravity()
+        """Update the solver after parameters of the model have changed: all of them, whatever the flags."""
+        self.dynamics.pack()
 
     @locked
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:

@@ -21,22 +21,13 @@ from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
+from jumper_warp.tasks import terms
 from jumper_warp.tasks.copying import Copyable, Struct
 from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
 from jumper_warp.tasks.functions import check_result, check_values, place_of, shown_type
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
-from jumper_warp.tasks.terms import (
-    Advance,
-    Curriculum,
-    EventTerm,
-    ObservationTerm,
-    RewardTerm,
-    StateMetric,
-    Term,
-    TerminationTerm,
-)
 from jumper_warp.utils.checks import MOST_SETTING, NAME, check_bounds, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
@@ -141,8 +132,8 @@ class Command(Copyable):
 class ObservationsCfg:
     """Observation terms of the policy (actor) and of the value network (critic), in the order of their columns."""
 
-    actor: tuple[ObservationTerm, ...]
-    critic: tuple[ObservationTerm, ...]
+    actor: tuple[terms.ObservationTerm, ...]
+    critic: tuple[terms.ObservationTerm, ...]
 
 
 @dataclass(frozen=True)
@@ -152,12 +143,12 @@ class TaskCfg(Copyable):
     name: str
     state: Any
     """The `@wp.struct` of one world's state, whose field `steps` counts the policy steps of the episode."""
-    advance: Advance
+    advance: terms.Advance
     reset: Reset
     command: Command
-    curriculum: Curriculum
-    rewards: tuple[RewardTerm, ...]
-    terminations: tuple[TerminationTerm, ...]
+    curriculum: terms.Curriculum
+    rewards: tuple[terms.RewardTerm, ...]
+    terminations: tuple[terms.TerminationTerm, ...]
     """Terminations in order of priority; the first that is true ends the episode and is logged."""
     observations: ObservationsCfg
     motors: MotorCfg
@@ -166,7 +157,7 @@ class TaskCfg(Copyable):
     """[deg] Change of the motor target per unit of action, for (lateral, transversal) motors."""
     levels: tuple[Any, ...] = ()
     """Levels of the curriculum, easiest first: frozen dataclasses of one type with `struct` and `values()`."""
-    events: tuple[EventTerm, ...] = ()
+    events: tuple[terms.EventTerm, ...] = ()
     """Events in addition to those of `randomization`."""
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     gravity: float = EARTH
@@ -183,7 +174,7 @@ class TaskCfg(Copyable):
     """[m] Margin added to width and height of blocks for collisions with links in training; in evaluation it is 0."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
-    metrics: tuple[StateMetric, ...] = ()
+    metrics: tuple[terms.StateMetric, ...] = ()
     """Logged metrics of the task's state, in addition to the means of all terms."""
     evaluation: Evaluation = field(default_factory=EpisodeEvaluation)
     """Evaluation of the task's policies, by `jumper evaluate` and `play`."""
@@ -307,11 +298,11 @@ class TaskCfg(Copyable):
 
         section: "rewards", "terminations" or "events". Raises InputError: a term or number is unknown.
         """
-        terms: tuple[Term, ...] = getattr(self, section)
-        unknown = set(changes) - {term.name for term in terms}
+        present: tuple[terms.Term, ...] = getattr(self, section)
+        unknown = set(changes) - {term.name for term in present}
         if unknown:
             raise InputError(f"{self.name} has no {section} term {sorted(unknown)[0]!r}")
-        return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in terms)})
+        return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in present)})
 
     def without_noise(self) -> TaskCfg:
         """Return a copy of the task with observation noise 0 for actor and critic; delays stay."""

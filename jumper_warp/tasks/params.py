@@ -33,7 +33,6 @@ class TermSlot(SimpleNamespace):
         super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
         self.term = term
         self.func = term.func
-        self.parameterless = not term.num_params  # Warp refuses an empty `*p[start:start]`
         self.first = offset
         self.start = offset + len(settings)
         self.stop = offset + len(numbers)

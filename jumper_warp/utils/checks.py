@@ -13,7 +13,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import Json
+from jumper_warp.utils.files import ErrorType, Json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -211,6 +211,14 @@ def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float,
         )
     if not (lower_zone >= 0.0 and upper_zone >= 0.0 and lower_zone + upper_zone <= upper - lower):
         raise InputError(f"{name}: hard zones must be >= 0 without overlap, got {lower_zone}, {upper_zone}")
+
+
+def check_network(hidden: Sequence[int], activation: str, error: ErrorType = InputError) -> None:
+    """Raise `error` if the widths of the hidden layers are out of range, or their activation is unknown."""
+    if not 1 <= len(hidden) <= MAX_HIDDEN or not 1 <= min(hidden) <= max(hidden) <= MAX_WIDTH:
+        raise error(f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}, got {hidden!s:.100}")
+    if activation not in ACTIVATIONS:
+        raise error(f"activation must be one of {', '.join(ACTIVATIONS)}, got {activation!r:.40}")
 
 
 def check_filter_speed(horizon: float, speed_floor: float) -> None:

@@ -39,16 +39,13 @@ if TYPE_CHECKING:
         gravity: wp.array
         joint_armature: wp.array
         joint_axis: wp.array
-        joint_child: wp.array
         joint_damping: wp.array
         joint_f: wp.array
         joint_friction: wp.array
         joint_mimic_joint: wp.array
-        joint_parent: wp.array
         joint_q: wp.array
         joint_qd: wp.array
         joint_qd_start: wp.array
-        joint_X_c: wp.array
         joint_X_p: wp.array
         shape_body: wp.array
         shape_color: wp.array

@@ -18,21 +18,10 @@ from jumper_warp.utils.checks import check_count, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.progress import phase
+from jumper_warp.viz import scene
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import FIELD_OF_VIEW, Line, View, open_renderer
-from jumper_warp.viz.scene import (
-    ABOVE,
-    REACH,
-    Label,
-    annotate,
-    body_paths,
-    corners,
-    fit,
-    follow,
-    velocity_arrows,
-    without_divergence,
-)
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 
@@ -79,7 +68,7 @@ def write_film(
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     check_type("ranks", ranks, Sequence[int])
     check_count("number of ranks", len(ranks))
-    recording = without_divergence(recording)
+    recording = scene.without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
     images = _images(recording, times, size, eye, field_of_view, ranks, path.name)
     if path.suffix != ".mp4":
@@ -126,11 +115,11 @@ def _images(
     """Yield the annotated images of a film at `times` [s], with a progress bar; name: label of the bar."""
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
     poses = drawn_poses(recording, times)
-    paths = body_paths(recording, ranks)
-    targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
+    paths = scene.body_paths(recording, ranks)
+    targets = scene.follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
     seen = paths - targets[:, None]
     if len(recording.commands) or not recording.contact_forces.any():  # arrows; raised legs of a floating robot
-        seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
+        seen = np.concatenate([seen, seen + [0.0, 0.0, scene.REACH - scene.ABOVE]], axis=1)
     frame_view = _view(seen, size, eye, field_of_view)
     targets = _interpolated(recording, targets, times)
     bases = _interpolated(recording, paths, times)
@@ -142,8 +131,8 @@ def _images(
             view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target, field_of_view)
             image = renderer.draw(poses[i], view, _lines(recording, paths, bases[i], frame, ranks))
             named = zip(ranks, bases[i], strict=True) if len(ranks) > 1 else ()
-            labels = [Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in named]
-            yield annotate(image, view, labels, f"{recording.heading(ranks)}   {time:.2f} s".strip())
+            labels = [scene.Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in named]
+            yield scene.annotate(image, view, labels, f"{recording.heading(ranks)}   {time:.2f} s".strip())
             advance()
 
 
@@ -192,7 +181,7 @@ def _view(
     """
     if eye is not None:
         return View(np.asarray(eye, dtype=float), np.zeros(3), field_of_view)
-    return fit(corners(paths), np.array(DIRECTION), size, field_of_view)
+    return scene.fit(scene.corners(paths), np.array(DIRECTION), size, field_of_view)
 
 
 def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:
@@ -207,7 +196,7 @@ def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: in
         if frame > first:
             lines.append(Line(path[first : frame + 1], BASE_COLOR))
             lines += [Line(paws[:, leg], color) for leg, color in enumerate(LEG_COLORS.values()) if leg < paws.shape[1]]
-        lines += velocity_arrows(recording, frame, rank, base + [0.0, 0.0, 0.3])
+        lines += scene.velocity_arrows(recording, frame, rank, base + [0.0, 0.0, 0.3])
     return lines
 
 

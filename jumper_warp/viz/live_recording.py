@@ -28,13 +28,13 @@ class LiveRecording:
         if self._sent == 0:
             layout = blueprint(recording, self._seconds, "following")
             self._stream.send_blueprint(layout, make_active=True, make_default=True)
-        RecordingWriter(rr, self._stream, recording, static=self._sent == 0).write()
+        RecordingWriter(self._stream, recording, static=self._sent == 0).write()
         self._sent = recorder.frames
         self._bodies = len(recording.bodies)
 
     def finish(self, recording: Recording) -> None:
         """Send the remaining frames, and everything that depends on the whole recording: trails, goals, the layout."""
         first = self._sent if len(recording.bodies) == self._bodies else 0  # blocks were added
-        RecordingWriter(rr, self._stream, recording, first=first).write()
+        RecordingWriter(self._stream, recording, first=first).write()
         self._stream.send_blueprint(blueprint(recording), make_active=True, make_default=True)
         self._stream.disconnect()

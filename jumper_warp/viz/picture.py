@@ -179,13 +179,8 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
     places: base positions in the picture [m], (num_frames, 2), to the right and up.
     """
     apexes = [first + int(np.argmax(places[first : last + 1, 1])) for first, last in flights]
-    wanted = [
-        *_spread(apexes, MOST - 2),
-        len(places) - 1,
-        0,
-        *(last for _, last in flights),
-        *(first for first, _ in flights),
-    ]
+    takeoffs, touchdowns = zip(*flights, strict=True)
+    wanted = [*_spread(apexes, MOST - 2), len(places) - 1, 0, *touchdowns, *takeoffs]
     chosen: list[int] = []
     while len(chosen) < MOST:
         distance = np.full(len(places), np.inf)

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from jumper_warp.viz.recording import Recording
-from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.shapes import ShapeMesh, smooth_shape
 from jumper_warp.viz.style import GOAL_COLOR
 
 RING_RADIUS = 0.1  # [m] outer radius of a goal's ring: largest error of a successful jump
@@ -36,7 +36,7 @@ def goal_shapes(recording: Recording) -> list[ShapeMesh]:
         place = np.array([x, y + BAR_OFFSET, height])
         shapes.append((f"height_{rank}", rank, bar, place))
     return [
-        _shape(name, -1, GOAL_COLOR, mesh.apply_translation(place + (0.0, rank * recording.spacing, 0.0)))
+        smooth_shape(name, -1, GOAL_COLOR, mesh.apply_translation(place + (0.0, rank * recording.spacing, 0.0)))
         for name, rank, mesh, place in shapes
         if np.isfinite(place).all()
     ]
@@ -86,14 +86,7 @@ def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, hei
         pose[:, 0, 2] = 0.5 * height[rank]
         pose[:, 0, 6] = 1.0
         box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank]))
-        shapes.append(_shape("block", len(names), BLOCK_COLOR, box))
+        shapes.append(smooth_shape("block", len(names), BLOCK_COLOR, box))
         names.append(f"world_{world}/block")
         poses.append(pose)
     return replace(recording, poses=np.concatenate(poses, axis=1), bodies=tuple(names), shapes=tuple(shapes))
-
-
-def _shape(name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh) -> ShapeMesh:
-    """Convert a mesh [m] in the body's frame to a shape."""
-    smooth = mesh.smooth_shaded
-    surface = (np.asarray(smooth.vertices, np.float32), np.asarray(smooth.vertex_normals, np.float32))
-    return ShapeMesh(name, body, color, *surface, np.asarray(smooth.faces, np.int32))

@@ -18,10 +18,11 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.files import write_atomically
@@ -51,13 +52,11 @@ def write_rrd(recording: Recording, path: Path) -> Path:
     Rerun collects it in memory: on a full disk its own writer would wait for ever.
     Raises OSError.
     """
-    import rerun as rr
-
     check_type("recording", recording, Recording)
     stream = rr.RecordingStream("jumper-warp")
     memory = stream.memory_recording()
     stream.send_blueprint(blueprint(recording), make_active=False, make_default=True)
-    RecordingWriter(rr, stream, recording).write()
+    RecordingWriter(stream, recording).write()
     write_atomically(Path(path), memory.drain_as_bytes())
     return Path(path)
 
@@ -65,14 +64,11 @@ def write_rrd(recording: Recording, path: Path) -> Path:
 class RecordingWriter:
     """Writer of one recording to a Rerun stream, with one call for all frames of an entity."""
 
-    def __init__(
-        self, rr: ModuleType, stream: Any, recording: Recording, *, static: bool = True, first: int = 0
-    ) -> None:
-        """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`.
+    def __init__(self, stream: Any, recording: Recording, *, static: bool = True, first: int = 0) -> None:
+        """Prepare to write a recording; stream: a `rerun.RecordingStream`.
 
         static: whether to write what does not change over time. first: first frame to write.
         """
-        self.rr = rr
         self.stream = stream
         self.recording = recording
         self.static = static
@@ -89,7 +85,7 @@ class RecordingWriter:
 
     def log_scene(self) -> None:
         """Log the scene: all shapes once, and over time the poses of all bodies and the camera's target."""
-        rr, recording = self.rr, self.recording
+        recording = self.recording
         parents = []
         for body in recording.bodies:
             world, link = body.split("/")
@@ -116,7 +112,6 @@ class RecordingWriter:
 
     def log_world(self, rank: int) -> None:
         """Log position, trail, contact forces and velocities of the rank-th recorded world."""
-        rr = self.rr
         recording = self.recording
         parent = ["scene", self.worlds[rank]]
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
@@ -147,41 +142,39 @@ class RecordingWriter:
         self, entity: list[str], origins: np.ndarray, vectors: np.ndarray, colors: Iterable[tuple[float, float, float]]
     ) -> None:
         """Log the same number of arrows in each frame; origins, vectors [m]: (frames, arrows, 3)."""
-        style = self.rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=_rgb(colors))
+        style = rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=_rgb(colors))
         self._log(entity, style)
         origins = origins[self.first :]
         vectors = vectors[self.first :]
-        columns = self.rr.Arrows3D.columns(origins=origins.reshape(-1, 3), vectors=vectors.reshape(-1, 3))
+        columns = rr.Arrows3D.columns(origins=origins.reshape(-1, 3), vectors=vectors.reshape(-1, 3))
         self._send(entity, columns.partition([origins.shape[1]] * len(origins)))
 
     def log_series(self) -> None:
         """Log each plot of the recording as scalars over time."""
         for plot in (plot for plots in _plots(self.recording).values() for plot in plots):
-            style = self.rr.SeriesLines(
-                names=plot.names, colors=_rgb(plot.colors), widths=[plot.width] * len(plot.names)
-            )
+            style = rr.SeriesLines(names=plot.names, colors=_rgb(plot.colors), widths=[plot.width] * len(plot.names))
             self._log(plot.entity, style)
-            self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values[self.first :]))
+            self._send(plot.entity, rr.Scalars.columns(scalars=plot.values[self.first :]))
 
     def log_states(self) -> None:
         """Log the states, as text, in the frames in which they change."""
         for name, words in self.recording.states.items():
             frames = range(self.first, len(words))
             changes = [i for i in frames if i == self.first or words[i] != words[i - 1]]
-            columns = self.rr.StateChange.columns(state=[words[i] for i in changes])
+            columns = rr.StateChange.columns(state=[words[i] for i in changes])
             self._send(["states", *name.split("/", 1)], columns, changes)
 
     def _log(self, entity: list[str], archetype: Any) -> None:
         """Log what does not change over time."""
         if self.static:
-            self.stream.log(self.rr.new_entity_path(entity), archetype, static=True)
+            self.stream.log(rr.new_entity_path(entity), archetype, static=True)
 
     def _send(self, entity: list[str], columns: Any, frames: Sequence[int] | None = None) -> None:
         """Log an entity's values, one for each of some frames (default: all from the first one on)."""
         frames = range(self.first, len(self.recording.times)) if frames is None else frames
         if len(frames):
-            times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[list(frames)])]
-            self.stream.send_columns(self.rr.new_entity_path(entity), times, columns)
+            times = [rr.TimeColumn(TIMELINE, duration=self.recording.times[list(frames)])]
+            self.stream.send_columns(rr.new_entity_path(entity), times, columns)
 
 
 def _world_names(recording: Recording) -> list[str]:
@@ -289,9 +282,6 @@ def blueprint(
     The viewer plays in a loop from the beginning, with all panels collapsed. seconds: end of the time axis [s]
     (default: the recording's). play_state: Rerun's, "following" for a recording that grows.
     """
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     start = float(recording.times[0])
     end = max(float(recording.times[-1]), seconds)
     limits = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (start, end + LEGEND_SHARE * (end - start)))
@@ -321,9 +311,6 @@ def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
     axis: Rerun's time axis.
     Legends are in the free part of the time axis; of the motors' views only the first has one.
     """
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     by_motor = len(plots) > 1 and all(plot.by_leg for plot in plots)
     return [
         rrb.TimeSeriesView(
@@ -338,8 +325,6 @@ def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
 
 def _scene_view(recording: Recording) -> Any:
     """Return the view of the scene, whose camera follows `scene/view_target`."""
-    import rerun.blueprint as rrb
-
     targets, distance = view_targets(recording)
     eye = rrb.EyeControls3D(
         position=targets[0] + distance * EYE_DIRECTION,

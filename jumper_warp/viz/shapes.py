@@ -152,12 +152,12 @@ def _placed(
     x, y, z, w = placement[3:]
     matrix = trimesh.transformations.quaternion_matrix([w, x, y, z])
     matrix[:3, 3] = placement[:3]
-    smooth = mesh.copy().apply_transform(matrix).smooth_shaded
-    return ShapeMesh(
-        name,
-        body,
-        (float(color[0]), float(color[1]), float(color[2])),
-        np.asarray(smooth.vertices, dtype=np.float32),
-        np.asarray(smooth.vertex_normals, dtype=np.float32),
-        np.asarray(smooth.faces, dtype=np.int32),
-    )
+    red, green, blue = map(float, color)
+    return smooth_shape(name, body, (red, green, blue), mesh.copy().apply_transform(matrix))
+
+
+def smooth_shape(name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh) -> ShapeMesh:
+    """Return a mesh in the body's frame as a shape with smooth normals, sharp at edges; color: RGB, each in [0, 1]."""
+    smooth = mesh.smooth_shaded
+    surface = (np.asarray(smooth.vertices, np.float32), np.asarray(smooth.vertex_normals, np.float32))
+    return ShapeMesh(name, body, color, *surface, np.asarray(smooth.faces, np.int32))

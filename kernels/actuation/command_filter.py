@@ -23,6 +23,7 @@ or where x leaves the limits on one side while c lies beyond the other.
 import warp as wp
 
 from ..scalar import real, vec3
+from ..state import leg_coord, leg_dof, load_motors
 
 # [rad] two turns: commands are clamped to +- this first, so that an infinite command does not become NaN
 COMMAND_BOUND = wp.constant(real(12.566370614359172))
@@ -103,8 +104,6 @@ def command_filter_kernel(
     raw_target: wp.array2d(dtype=real),
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
-    coords_per_world: int,
-    dofs_per_world: int,
     offset: wp.array2d(dtype=real),
     params: FilterParams,
     # out
@@ -112,20 +111,17 @@ def command_filter_kernel(
 ):
     """Write every leg's motor targets after the command filter; launch over (4, worlds), from world `first` on.
 
-    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds; after the base's
-    7 coordinates (6 rates) come five joints a leg: lateral, outer, outer knee, inner, inner knee. offset [rad],
+    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds. offset [rad],
     (12, num_worlds): reading minus true angle of each position sensor; the filter uses the reading, as on the robot.
     """
     leg, world = wp.tid()
     world += first
     lateral, outer, inner = 3 * leg, 3 * leg + 1, 3 * leg + 2
-    coord = coords_per_world * world + 7 + 5 * leg
-    dof = dofs_per_world * world + 6 + 5 * leg
-    error = vec3(offset[lateral, world], offset[outer, world], offset[inner, world])
     filtered = filter_leg(
         vec3(raw_target[lateral, world], raw_target[outer, world], raw_target[inner, world]),
-        vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]) + error,
-        vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
+        load_motors(joint_q, leg_coord(world, leg))
+        + vec3(offset[lateral, world], offset[outer, world], offset[inner, world]),
+        load_motors(joint_qd, leg_dof(world, leg)),
         params,
     )
     filtered_target[lateral, world] = filtered[0]

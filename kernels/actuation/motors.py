@@ -6,7 +6,7 @@ angle: it swings the paw outward (lateral), or the thigh away from the leg's oth
 
 import warp as wp
 
-from ..layout import motor_slot
+from ..layout import COORDS, DOFS, motor_slot
 from ..scalar import real
 
 
@@ -86,19 +86,17 @@ def motor_torque_kernel(
     target: wp.array2d(dtype=real),
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
-    coords_per_world: int,
-    dofs_per_world: int,
     motors: MotorArrays,
     # out
     joint_f: wp.array(dtype=real),
 ):
     """Write the motor torques [N m] to their entries of Newton's joint_f; launch over (12, num_worlds).
 
-    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay. The
-    base has the first 7 coordinates and 6 rates of a world; `motor_slot` skips the passive knees.
+    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay.
+    `motor_slot` skips the passive knees.
     """
     motor, world = wp.tid()
-    coord = coords_per_world * world + 7 + motor_slot(motor)
-    dof = dofs_per_world * world + 6 + motor_slot(motor)
+    coord = COORDS * world + 7 + motor_slot(motor)
+    dof = DOFS * world + 6 + motor_slot(motor)
     params = load_motor(motors, motor, world)
     joint_f[dof] = motor_torque(target[motor, world], joint_q[coord], joint_qd[dof], params)

@@ -11,6 +11,7 @@ from ..layout import BODIES, COORDS, DOFS
 from ..scalar import real, vec3, vec6
 from ..state import leg_dof, load_motors
 from ..terrain.ground import rest_block
+from .parameters import load_vec3
 from .step import RobotModel
 
 wp.set_module_options({"enable_backward": False})
@@ -86,12 +87,10 @@ def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
         leg.lateral = load_motor(drive.motors, 3 * k, world)
         leg.outer = load_motor(drive.motors, 3 * k + 1, world)
         leg.inner = load_motor(drive.motors, 3 * k + 2, world)
-        leg.target = vec3(drive.target[3 * k, world], drive.target[3 * k + 1, world], drive.target[3 * k + 2, world])
+        leg.target = load_vec3(drive.target, 3 * k, world)
         if drive.delay.shape[0] > 0:
             leg.delay = drive.delay[world]
-            leg.previous = vec3(
-                drive.previous[3 * k, world], drive.previous[3 * k + 1, world], drive.previous[3 * k + 2, world]
-            )
+            leg.previous = load_vec3(drive.previous, 3 * k, world)
     return leg
 
 

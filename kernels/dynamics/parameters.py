@@ -127,25 +127,8 @@ def motor_dof(leg: int, motor: int) -> int:
 
 
 @wp.kernel
-def pack_masses_kernel(
+def pack_constants_kernel(
     # in
-    body_mass: wp.array(dtype=float),
-    body_com: wp.array(dtype=wp.vec3),
-    body_inertia: wp.array(dtype=wp.mat33),
-    # out
-    table: wp.array2d(dtype=real),
-):
-    """Write the mass moments of every body from Newton's model to the parameter table; one thread per (world, body)."""
-    world, body = wp.tid()
-    i = world * layout.BODIES + body
-    store_link(table, body_row(body), world, body_mass[i], body_com[i], body_inertia[i])
-
-
-@wp.kernel
-def pack_joints_kernel(
-    # in
-    armature: wp.array(dtype=float),
-    friction: wp.array(dtype=float),
     damping: wp.array(dtype=float),
     lower: wp.array(dtype=float),
     upper: wp.array(dtype=float),
@@ -154,28 +137,30 @@ def pack_joints_kernel(
     effort_limit: wp.array(dtype=float),
     sum_lower: float,
     sum_upper: float,
+    springs: wp.array(dtype=wp.vec2),
+    gravity: wp.array(dtype=wp.vec3),
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write armature, friction, damping and hard stops of every leg to the parameter table; thread per (world, leg).
+    """Write damping, hard stops and spring of every leg, and gravity, to the parameter table; thread per (world, leg).
 
     Arrays: Newton's per-dof model arrays, (38 num_worlds,), [rad], [N m] and their rates as in `JointParams` and
     `StopParams`; effort_limit [N m] caps the knees' damping. sum_lower, sum_upper [rad]: stops of outer + inner.
+    springs: stiffness [N/m] and rest length [m] of each world. gravity: [m/s^2] of each world, world frame.
     """
     world, leg = wp.tid()
     row = leg * layout.LEG_ROWS
     dof = world * layout.DOFS + 6 + 5 * leg
     for j in range(3):
         i = world * layout.DOFS + motor_dof(leg, j)
-        table[row + layout.ARMATURE + j, world] = real(armature[i])
-        table[row + layout.FRICTION + j, world] = real(friction[i])
         table[row + layout.DAMPING + j, world] = real(damping[i])
         table[row + layout.LOWER + j, world] = real(lower[i])
         table[row + layout.UPPER + j, world] = real(upper[i])
-    table[row + layout.KNEE_DAMPING, world] = real(damping[dof + 2])
-    table[row + layout.KNEE_DAMPING + 1, world] = real(damping[dof + 4])
-    table[row + layout.KNEE_LIMIT, world] = real(effort_limit[dof + 2])
-    table[row + layout.KNEE_LIMIT + 1, world] = real(effort_limit[dof + 4])
+        table[layout.GRAVITY + j, world] = real(gravity[world][j])
+    for j in range(2):
+        table[row + layout.KNEE_DAMPING + j, world] = real(damping[dof + 2 + 2 * j])
+        table[row + layout.KNEE_LIMIT + j, world] = real(effort_limit[dof + 2 + 2 * j])
+        table[row + layout.SPRING + j, world] = real(springs[world][j])
     table[row + layout.SUM_LOWER, world] = real(sum_lower)
     table[row + layout.SUM_UPPER, world] = real(sum_upper)
     table[row + layout.STOP_KE, world] = real(limit_ke[dof + 1])
@@ -204,21 +189,6 @@ def store_friction(table: wp.array2d(dtype=real), leg: int, world: int, mu: floa
 
 
 @wp.kernel
-def pack_friction_kernel(
-    # in
-    paw_shapes: wp.array(dtype=int),
-    ground_shape: int,
-    shape_mu: wp.array(dtype=float),
-    static_ratio: wp.array(dtype=float),
-    # out
-    table: wp.array2d(dtype=real),
-):
-    """Write the friction coefficients of every paw (`paw_friction`) to the parameter table; thread per (world, leg)."""
-    world, leg = wp.tid()
-    store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
-
-
-@wp.kernel
 def repack_kernel(
     # in
     first: int,
@@ -238,7 +208,7 @@ def repack_kernel(
     """Copy the parameters that domain randomisation changes to the parameter table, where mask (num_worlds,) is not 0.
 
     Launch over (worlds from `first` on, 25): threads 0 to 20 of a world write the mass moments of a body each, the
-    other four a leg's armature, friction torques and paw friction. Inputs as in the pack kernels.
+    other four a leg's armature, friction torques and paw friction. Inputs: Newton's model arrays, see `paw_friction`.
     """
     world, part = wp.tid()
     world += first
@@ -254,29 +224,3 @@ def repack_kernel(
         table[leg * layout.LEG_ROWS + layout.ARMATURE + j, world] = real(armature[dof])
         table[leg * layout.LEG_ROWS + layout.FRICTION + j, world] = real(friction[dof])
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
-
-
-@wp.kernel
-def pack_springs_kernel(
-    # in
-    springs: wp.array(dtype=wp.vec2),
-    # out
-    table: wp.array2d(dtype=real),
-):
-    """Write every leg's spring (stiffness [N/m], rest length [m]) to the parameter table; thread per (world, leg)."""
-    world, leg = wp.tid()
-    for j in range(2):
-        table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])
-
-
-@wp.kernel
-def pack_gravity_kernel(
-    # in
-    gravity: wp.array(dtype=wp.vec3),
-    # out
-    table: wp.array2d(dtype=real),
-):
-    """Write gravity [m/s^2], (num_worlds,), world frame, to the parameter table; one thread per world."""
-    world = wp.tid()
-    for j in range(3):
-        table[layout.GRAVITY + j, world] = real(gravity[world][j])

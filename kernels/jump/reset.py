@@ -15,20 +15,8 @@ from ..mdp.random import RngStream, uniform, uniform_range
 from ..mdp.reset import leg_limits
 from ..mdp.view import RobotArrays, RobotView, base_pos, rotate_yaw, yaw_of
 from ..terrain.ground import Block, Ground, rest_block, surface, world_ground
-from . import streams
+from . import start_states, streams
 from .ground_draws import GroundRanges, footprint, sample_ground
-from .start_states import (
-    AFTER_LANDING,
-    DEFAULT,
-    IN_FLIGHT,
-    PUSHING,
-    STANDING,
-    TOUCHDOWN,
-    JumpStart,
-    ResetRanges,
-    sample_start_mode,
-    write_start,
-)
 from .state import FLIGHT, LANDED, STANCE, JumpState
 
 wp.set_module_options({"enable_backward": False})
@@ -38,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 class JumpSettings:
     """Ranges from which the reset of a jump episode samples start state and ground."""
 
-    states: ResetRanges
+    states: start_states.ResetRanges
     grounds: GroundRanges
 
 
@@ -92,7 +80,7 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) ->
 
 
 @wp.func
-def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
+def sample_command_step(rng: RngStream, ranges: start_states.ResetRanges) -> int:
     """Return the sampled policy step at which the jump is commanded.
 
     It is up to `long_wait` with `long_wait_probability`, else up to `command_delay`. A varying delay makes the robot
@@ -107,7 +95,7 @@ def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
 
 @wp.func
 def begin_jump(
-    rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
+    rng: RngStream, ranges: start_states.ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
     next_jump_probability: float,
 ) -> JumpState:  # fmt: skip
     """Return the task state of a new episode: phase of the jump and time of its command, according to the start mode.
@@ -124,18 +112,18 @@ def begin_jump(
     state.command_step = sample_command_step(rng, ranges)
     state.next_jump_delay = ranges.next_jump_delay
     state.next_jump_step = sample_next_jump_step(rng, ranges.next_jump_delay, next_jump_probability)
-    if start_mode == PUSHING or (start_mode == STANDING and ranges.lean > 0.0):
+    if start_mode == start_states.PUSHING or (start_mode == start_states.STANDING and ranges.lean > 0.0):
         state.start = wp.vec3(0.0, 0.0, pos[2])
-    if start_mode == PUSHING:
+    if start_mode == start_states.PUSHING:
         state.command_step = 0
         state.squat = 0.0  # before the start, as deep as any
-    if start_mode == IN_FLIGHT or start_mode == TOUCHDOWN:
+    if start_mode == start_states.IN_FLIGHT or start_mode == start_states.TOUCHDOWN:
         state.phase = FLIGHT
         state.command_step = 0
         if vz <= 0.0:
             state.apex_passed = 1
             state.max_height = wp.max(goal[2], pos[2])
-    if start_mode == AFTER_LANDING:
+    if start_mode == start_states.AFTER_LANDING:
         state.phase = LANDED
         state.command_step = 0
         state.apex_passed = 1
@@ -170,14 +158,14 @@ def begin_next_jump(robot: RobotView, old: JumpState, ground: Ground, goal: wp.v
 
 
 @wp.func
-def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
+def place_ground(ground: Ground, start: start_states.JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
     """Sample a new block for a world, or put the present one back to its start position; return the world's ground.
 
     It is sampled if a probability of `grounds` is positive; only standing starts (STANDING, DEFAULT) get a block.
     """
     if grounds.platform + grounds.block > 0.0:
         block = Block()
-        if start.start_mode == STANDING or start.start_mode == DEFAULT:
+        if start.start_mode == start_states.STANDING or start.start_mode == start_states.DEFAULT:
             block = sample_ground(rng, grounds, footprint(start.ranges, start.heading), start.goal)
         ground.blocks[rng.world] = block
     else:
@@ -199,15 +187,15 @@ def reset_jump(
     ranges = settings.states
     steps_per_mode = old.steps_per_mode
     steps_per_mode[old.start_mode] += float(old.steps)
-    start = JumpStart()
-    start.start_mode = sample_start_mode(rng, ranges, steps_per_mode)
+    start = start_states.JumpStart()
+    start.start_mode = start_states.sample_start_mode(rng, ranges, steps_per_mode)
     start.heading = uniform(rng, streams.HEADING, -ranges.heading, ranges.heading)
     start.goal = rotate_yaw(sample_goal(rng, level), start.heading)
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
     start.ground = place_ground(scene.ground, start, settings.grounds, rng)
-    start_mode = write_start(arrays, scene, start, rng)
+    start_mode = start_states.write_start(arrays, scene, start, rng)
     vz = arrays.joint_qd[world * DOFS + 2]
     state = begin_jump(rng, ranges, start_mode, start.goal, base_pos(arrays, world), vz, level.next_jump_probability)
     state.heading = start.heading
@@ -261,4 +249,4 @@ def from_standing(state: JumpState) -> bool:
 
     Other episodes begin in the middle of a jump, whose success is partly given.
     """
-    return state.start_mode <= DEFAULT
+    return state.start_mode <= start_states.DEFAULT

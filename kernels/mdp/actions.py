@@ -7,7 +7,8 @@ steps. The target of an action arrives at the motors after the world's latency, 
 import warp as wp
 
 from ..actuation.command_filter import filter_leg
-from ..layout import BODIES, COORDS, DOFS
+from ..layout import BODIES
+from ..state import leg_coord, leg_dof, load_motors
 from .env import RING, Delays, EpisodeArrays, SkillSettings
 from .view import RobotArrays, base_quat, base_velocity
 
@@ -64,10 +65,8 @@ def action_kernel(
     leg, world = wp.tid()
     world += episode.first
     skill = skills[episode.skill[world]]
-    q = world * COORDS + 7 + 5 * leg
-    d = world * DOFS + 6 + 5 * leg
-    angles = wp.vec3(arrays.joint_q[q], arrays.joint_q[q + 1], arrays.joint_q[q + 3])
-    rates = wp.vec3(arrays.joint_qd[d], arrays.joint_qd[d + 1], arrays.joint_qd[d + 3])
+    angles = load_motors(arrays.joint_q, leg_coord(world, leg))
+    rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
     target = wp.vec3(0.0)
     for j in range(3):
         m = 3 * leg + j

@@ -79,9 +79,6 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     if stage != wp.static(STARTUP):
                         timer[i, world] = left
                 if due:
-                    if wp.static(slots[i].parameterless):
-                        wp.static(slots[i].func)(robot, rng)
-                    else:
-                        wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)])
+                    wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)])
 
     return wp.kernel(unrolled(event_kernel), module="unique", module_options=FAST)

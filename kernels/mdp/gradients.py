@@ -48,38 +48,23 @@ def make_gradient_kernel(task: Any) -> wp.Kernel:
         """
         world = wp.tid()
         robot = load_view(arrays, ground, world)
-        if wp.static(advance.parameterless):
-            state = wp.static(advance.func)(robot, states[world])
-        else:
-            state = wp.static(advance.func)(
-                robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)]
-            )
+        state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)])
         for i in range(wp.static(len(rewards))):
             weight = p[wp.static(rewards[i].weight)]
             if wp.static(bool(rewards[i].scale_by_dt)):
                 weight = weight * arrays.step_dt
             if weight != 0.0:
-                if wp.static(rewards[i].parameterless):
-                    term_value[i, world] = weight * wp.static(rewards[i].func)(robot, state)
-                else:
-                    term_value[i, world] = weight * wp.static(rewards[i].func)(
-                        robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
-                    )
+                term_value[i, world] = weight * wp.static(rewards[i].func)(
+                    robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
+                )
         for i in range(wp.static(len(slots))):
             if wp.static(reads_arrays[i]):
                 store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
             elif wp.static(not constant[i]):
-                if wp.static(slots[i].parameterless):
-                    store(wp.static(slots[i].func)(robot, state), wp.static(rows[i]), world, raw)
-                else:
-                    store(
-                        wp.static(slots[i].func)(
-                            robot, state, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]
-                        ),
-                        wp.static(rows[i]),
-                        world,
-                        raw,
-                    )
+                store(
+                    wp.static(slots[i].func)(robot, state, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]),
+                    wp.static(rows[i]), world, raw,
+                )  # fmt: skip
 
     name = kernel_name("gradient_kernel", task.state)
     return wp.kernel(unrolled(gradient_kernel), name=name, module="unique", module_options=OPTIONS)

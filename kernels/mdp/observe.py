@@ -141,8 +141,6 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                         ok = store(wp.static(slots[i].func)(parameters, world), wp.static(rows[i]), world, raw)
                     elif wp.static(reads_ground[i]):
                         ok = store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
-                    elif wp.static(slots[i].parameterless):
-                        ok = store(wp.static(slots[i].func)(robot, states[world]), wp.static(rows[i]), world, raw)
                     else:
                         ok = store(
                             wp.static(slots[i].func)(

@@ -110,12 +110,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         if episode.skill[world] != skill:
             return
         robot = load_view(arrays, ground, world)
-        if wp.static(advance.parameterless):
-            state = wp.static(advance.func)(robot, states[world])
-        else:
-            state = wp.static(advance.func)(
-                robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)]
-            )
+        state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)])
 
         termination = int(NOT_TERMINATED)
         timeout = float(0.0)
@@ -128,13 +123,9 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 faulty = wp.static(len(rewards) + 1)
         for i in range(wp.static(len(endings))):
             if termination == NOT_TERMINATED:
-                if wp.static(endings[i].parameterless):
-                    holds = wp.static(endings[i].func)(robot, state)
-                else:
-                    holds = wp.static(endings[i].func)(
-                        robot, state, *p[wp.static(endings[i].start) : wp.static(endings[i].stop)]
-                    )
-                if holds:
+                if wp.static(endings[i].func)(
+                    robot, state, *p[wp.static(endings[i].start) : wp.static(endings[i].stop)]
+                ):
                     termination = i
                     timeout = wp.where(wp.static(bool(endings[i].time_out)), 1.0, 0.0)
                     success = wp.static(bool(endings[i].success))
@@ -147,12 +138,9 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             weight = p[wp.static(rewards[i].weight)]
             value = float(0.0)
             if weight != 0.0 and not diverged:
-                if wp.static(rewards[i].parameterless):
-                    value = weight * wp.static(rewards[i].func)(robot, state)
-                else:
-                    value = weight * wp.static(rewards[i].func)(
-                        robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
-                    )
+                value = weight * wp.static(rewards[i].func)(
+                    robot, state, *p[wp.static(rewards[i].start) : wp.static(rewards[i].stop)]
+                )
                 if wp.static(bool(rewards[i].scale_by_dt)):
                     value = value * arrays.step_dt
             term_value[i, world] = value

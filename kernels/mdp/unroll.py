@@ -14,6 +14,7 @@ def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> An
     """Return a copy of a syntax tree, or a list of them, in which loops are replaced by copies of their bodies.
 
     A loop is replaced by copies of its body, one a value, if its `wp.static` expressions depend on the loop variable.
+    An empty slice, `*p[a:a]`, is left out of a call's arguments, since Warp refuses it.
     names: values of the function's free and global names. values: of the variables of the loops around the node.
     """
     if isinstance(node, list):
@@ -26,6 +27,10 @@ def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> An
         bounds = [_evaluated(bound, {**names, **values}) for bound in node.iter.args]
         bodies = [_written_out(node.body, names, {**values, node.target.id: value}) for value in range(*bounds)]
         return [statement for body in bodies for statement in body]
+    if isinstance(node, ast.Starred) and isinstance(node.value, ast.Subscript):
+        ends = node.value.slice
+        if _evaluated(ends.lower, {**names, **values}) == _evaluated(ends.upper, {**names, **values}):
+            return []
     if not isinstance(node, ast.AST):
         return node
     return type(node)(**{field: _written_out(child, names, values) for field, child in ast.iter_fields(node)})

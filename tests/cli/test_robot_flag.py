@@ -7,7 +7,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.conditions import env_of_recipe
-from jumper_warp.evaluation.run import EvaluationArgs, conditions_of, torque_limit
+from jumper_warp.evaluation.run import EvaluationArgs, torque_limit
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.output import read_values
@@ -47,9 +47,7 @@ def test_torque_limit_metric_includes_the_overlay(tmp_path):
     RobotOverlay({"saturation": 4 * (0.5, 0.9, 0.9)}).save(tmp_path / "weak.json")
     args = EvaluationArgs(robot=tmp_path / "weak.json", device="cpu")
     policy = Policy.load("vertical_jump")
-    nominal, weak = (
-        torque_limit(env_of_recipe(policy.recipe(), 1, conditions_of(a))) for a in (EvaluationArgs(), args)
-    )
+    nominal, weak = (torque_limit(env_of_recipe(policy.recipe(), 1, a)) for a in (EvaluationArgs(), args))
     assert nominal == 18.0 and weak == pytest.approx(16.2)  # [N m], transversal motors: 0.9 · 18
 
 

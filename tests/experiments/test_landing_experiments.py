@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from columns import X, Y
-from experiments import paper_tests
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
@@ -255,15 +254,6 @@ def test_suite_writes_metrics_plot_and_recording(suite, settings, files, policy,
     assert (saved[success], saved["torque_limit_nm"]) == (0.0, 18.0)
     for name in files:
         assert (tmp_path / name).stat().st_size > 1000, name
-
-
-def test_paper_tests_report_metrics_with_paper_values(policy, tmp_path, monkeypatch):
-    small = dataclasses.make_dataclass("Small", [("columns", int, 1), ("rows", int, 1)], bases=(Grid,), frozen=True)
-    monkeypatch.setattr(paper_tests, "suites_for", lambda evaluation: {"grid": small})
-    reported = paper_tests.main(paper_tests.Args(policies=(policy,), num_recorded=0, out=tmp_path, device="cpu"))
-    assert reported == read_values(tmp_path) and reported["still_grid_success_rate"] == 0.0
-    assert set(reported) == {f"still_grid_{name}" for name in Grid.paper}
-    assert (tmp_path / "still_grid" / "grid.png").is_file()
 
 
 def test_standing_policy_has_error_of_full_distance(policy, tmp_path):

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.policy_tables import MEASURED, filled, main_table, pages
 from experiments import measure_policies
 from experiments.measure_policies import payload_overlay, run_test, with_trials
-from experiments.policy_tables import MEASURED, filled, main_table, pages
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
@@ -68,7 +68,7 @@ def tasks():
 @pytest.mark.parametrize("page", pages(), ids=lambda page: f"{page.parent.name}-{page.stem}")
 def test_tables_of_the_pages_are_those_of_metrics_json(page, tasks):
     text = page.read_text(encoding="utf-8")
-    assert filled(text, tasks) == text, "run python experiments/policy_tables.py"
+    assert filled(text, tasks) == text, "run python -m docs.policy_tables"
 
 
 def test_measured_rows_have_machine_commit_and_date_and_their_tables_are_on_pages():

@@ -78,7 +78,7 @@ def test_thread_per_leg_matches_thread_per_world(kind):
     if kind == "springs":
         for dynamics in (legs, world):
             dynamics.leg_springs.fill_(wp.vec2(1000.0, 0.17))  # [N/m], [m]
-            dynamics.pack_springs()
+            dynamics.pack()
     found = advance(legs, q, qd, force, by_legs=True)
     expected = advance(world, q, qd, force, by_legs=False)
     assert (np.abs(expected[2]).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs with contact impulses

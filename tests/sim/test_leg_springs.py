@@ -36,7 +36,7 @@ def flight(n: int, springs: bool = True, double: bool = True) -> Flight:
     flight = Flight(model, double=double)
     if springs:
         flight.dynamics.leg_springs.assign(np.tile([STIFFNESS, LENGTH], (n, 1)).astype(np.float32))
-        flight.dynamics.pack_springs()
+        flight.dynamics.pack()
     return flight
 
 

@@ -189,7 +189,7 @@ def test_static_friction_holds_on_a_moving_block():
     sim = on_block(2, mass=1000.0, friction=0.0, friction_paws=0.2, motors=stiff_motors())
     dynamics = sim.solver.dynamics
     dynamics.static_friction_ratio.assign(np.array([4.0, 1.0], dtype=np.float32))
-    dynamics.pack_friction()
+    dynamics.pack()
     qd = sim.joint_qd().copy()
     qd[:, X] = 0.5
     write_state(sim, qd=qd)

@@ -150,11 +150,11 @@ def test_static_friction_holds_where_dynamic_friction_slides():
     sim, _ = on_slope(2, 12.4, friction=0.2)
     ratio = sim.solver.dynamics.static_friction_ratio
     ratio.fill_(5.0)
-    sim.solver.dynamics.pack_friction()
+    sim.solver.dynamics.pack()
     for _ in range(60):
         sim.step()
     ratio.assign(np.array([1.2, 1.0], dtype=np.float32))
-    sim.solver.dynamics.pack_friction()
+    sim.solver.dynamics.pack()
     before = paw_centres(sim)
     for _ in range(60):
         sim.step()

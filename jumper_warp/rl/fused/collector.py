@@ -13,7 +13,7 @@ import torch
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import aligned
-from jumper_warp.rl.fused import kernels
+from jumper_warp.rl.fused.kernels import rollout as kernels
 from jumper_warp.rl.fused.networks import FusedModel, blocks, launch
 from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic, Moments, RunningMoments, Scaling
 

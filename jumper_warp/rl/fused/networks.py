@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.rl.flat import ALIGNMENT, FlatParameters, Segment, aligned
-from jumper_warp.rl.fused import kernels
+from jumper_warp.rl.fused.kernels import layers as kernels
 from jumper_warp.rl.mirror import MirrorMap, Symmetry
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.utils.threads import available_threads

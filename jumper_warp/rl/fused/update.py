@@ -9,8 +9,9 @@ import torch
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.flat import FlatAdam
-from jumper_warp.rl.fused import kernels
 from jumper_warp.rl.fused.collector import FusedCollector
+from jumper_warp.rl.fused.kernels.losses import actor_loss, critic_loss
+from jumper_warp.rl.fused.kernels.optimiser import adam_step, prepare_step, sum_partials
 from jumper_warp.rl.fused.networks import FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
@@ -115,7 +116,7 @@ class FusedUpdate:
         """
         self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
         fused, gradient = self._fused, self._flat.all_reduced
-        launch(kernels.sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
+        launch(sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
             fused.partial, fused.layout.table, gradient, fused.partial.stride(0), len(gradient), fused.splits,
             fused.mirrored, SUM_BLOCK,
         )  # fmt: skip
@@ -125,7 +126,7 @@ class FusedUpdate:
         fused, rows = self._fused, len(samples)
         partial, layout, log_std = fused.partial, fused.layout, self._model.log_std
         output = fused.actor.forward(self._features, rows, samples)
-        launch(kernels.actor_loss, (fused.splits,), num_warps=8)(
+        launch(actor_loss, (fused.splits,), num_warps=8)(
             output, fused.mirror, self._samples, self._samples.shape[1], samples, log_std,
             self._collector.rollout.log_std, self._entropy_coef, fused.actor.grad_output, partial[0, layout.noise :],
             partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits), len(log_std),
@@ -138,7 +139,7 @@ class FusedUpdate:
         fused, cfg, rows = self._fused, self._cfg, len(samples)
         partial, critic = fused.partial, fused.critic
         output = critic.forward(self._critic_features, rows, samples)
-        launch(kernels.critic_loss, (fused.splits,), num_warps=8)(
+        launch(critic_loss, (fused.splits,), num_warps=8)(
             output, self._samples, self._samples.shape[1], samples, critic.grad_output,
             partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits),
             len(self._model.log_std), cfg.clip, cfg.value_coef, cfg.clip_value, critic.width, LOSS_ROWS,
@@ -148,11 +149,11 @@ class FusedUpdate:
     def update_parameters(self) -> None:
         """Adapt the learning rate, clip the gradient, and run a step of Adam."""
         flat, cfg, adam, squares = self._flat, self._cfg, self._optimiser, self._squares
-        launch(kernels.prepare_step, (len(squares),))(
+        launch(prepare_step, (len(squares),))(
             flat.all_reduced, squares, adam.lr, adam.step_count, self._factors, self._desired_kl, flat.size,
             flat.actor_size, cfg.min_lr, cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
         )  # fmt: skip
-        launch(kernels.adam_step, (blocks(flat.size, ADAM_BLOCK),))(
+        launch(adam_step, (blocks(flat.size, ADAM_BLOCK),))(
             flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, self._factors,
             self._fused.weights, self._fused.layout.table, self._sums, flat.size, flat.actor_size, cfg.max_grad_norm,
             1 << (len(squares) - 1).bit_length(), len(squares), self._fused.mirrored, ADAM_BLOCK,

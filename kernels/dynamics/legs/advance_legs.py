@@ -17,17 +17,7 @@ Velocities `lin` and `ang` of the base are in its axes at the start of a step, f
 
 import warp as wp
 
-from ...actuation.stops import (
-    MAX_SETS,
-    SLACK,
-    StopRates,
-    beyond_stops,
-    change_one,
-    one_by_one,
-    pressed_stops,
-    revised_stops,
-    stop_rates,
-)
+from ...actuation import stops
 from ...lanes import any_world, first_leg, from_leg, max_legs, sum_legs, sum_vec, sync_lanes
 from ...layout import GRAVITY
 from ...scalar import real, vec3
@@ -136,7 +126,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 class StopAttempt:
     """Set of hard joint stops assumed pressed in an attempted step of a leg, and rates beyond which stops press."""
 
-    stop_rates: StopRates  # zero where no stop is near
+    stop_rates: stops.StopRates  # zero where no stop is near
     pressed: int
 
 
@@ -151,11 +141,11 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
-        stops = load_stops(model.table, leg, world)
-        if attempt.pressed != 0 or beyond_stops(stops, old.angles + dt * old.rates):
-            attempt.stop_rates = stop_rates(stops, old.angles, dt)
+        limits = load_stops(model.table, leg, world)
+        if attempt.pressed != 0 or stops.beyond_stops(limits, old.angles + dt * old.rates):
+            attempt.stop_rates = stops.stop_rates(limits, old.angles, dt)
             if old.pressed == 0:
-                attempt.pressed = pressed_stops(attempt.stop_rates, old.rates, real(0.0), 0)
+                attempt.pressed = stops.pressed_stops(attempt.stop_rates, old.rates, real(0.0), 0)
     return attempt
 
 
@@ -170,9 +160,9 @@ def required_stops(
     """
     limits = load_stops(model.table, leg, world)
     required = int(0)
-    if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
-        bounds = stop_rates(limits, angles, settings.dt)
-        required = revised_stops(bounds, rates, SLACK * settings.tolerance, pressed, sets)
+    if pressed != 0 or stops.beyond_stops(limits, angles + settings.dt * rates):
+        bounds = stops.stop_rates(limits, angles, settings.dt)
+        required = stops.revised_stops(bounds, rates, stops.SLACK * settings.tolerance, pressed, sets)
     return required
 
 
@@ -212,10 +202,10 @@ def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> L
     new = old
     new.sets = old.sets + 1
     new.pressed = pressed
-    if not one_by_one(new.sets):
+    if not stops.one_by_one(new.sets):
         new.pressed = required
     elif changes:
-        new.pressed = change_one(pressed, required)
+        new.pressed = stops.change_one(pressed, required)
     return new
 
 
@@ -234,10 +224,10 @@ def advance_leg(
     base = old.base
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = applied_torque(motors, old.step, old.angles, old.rates)
-    stops = stop_attempt(model, world, leg, old, dt)
-    pressed = stops.pressed
+    attempt = stop_attempt(model, world, leg, old, dt)
+    pressed = attempt.pressed
     spring = load_spring(model.table, leg, world)
-    terms = leg_terms(params, spring, old.angles, old.rates, torque, stops.stop_rates, pressed, base.ang, g, dt)
+    terms = leg_terms(params, spring, old.angles, old.rates, torque, attempt.stop_rates, pressed, base.ang, g, dt)
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
@@ -263,7 +253,7 @@ def advance_leg(
     required = required_stops(model, settings, world, leg, old.angles, rates, pressed, sets)
     first = first_leg(required != pressed)  # that needs another set; if none does, any leg
     agreed = from_leg(wp.where(required != pressed, real(1.0), real(0.0)), first) == real(0.0)
-    done = old.step < settings.substeps and (agreed or sets >= MAX_SETS)
+    done = old.step < settings.substeps and (agreed or sets >= stops.MAX_SETS)
     if blocks:
         push = sum_vec(wp.where(contact.on_block != 0, -solved.impulse, vec3(real(0.0))))
         if writes and done and model.ground.blocks[world].exists != 0:

@@ -11,22 +11,10 @@ import warp as wp
 from ...layout import DOFS
 from ...scalar import real
 from ...state import BaseState, base_com, leg_dof, store_motors
+from .. import trajectory as rows
 from ..contact import PawContact
 from ..drive import Drive, Workspace
 from ..step import RobotModel, StepSettings
-from ..trajectory import (
-    Actuation,
-    Commands,
-    Timing,
-    TrajectoryArrays,
-    arrival,
-    filter_commands,
-    leg_torque,
-    load_row_base,
-    row_vec3,
-    store_row_base,
-    store_row_vec3,
-)
 from .advance import advance_once
 from .world_step import LegStep
 
@@ -38,15 +26,15 @@ def rollout_kernel(
     # in
     model: RobotModel,
     settings: StepSettings,
-    timing: Timing,
-    actuation: Actuation,
-    commands: Commands,
+    timing: rows.Timing,
+    actuation: rows.Actuation,
+    commands: rows.Commands,
     drive: Drive,
     # in, out
     work: Workspace,
     # out
     filtered_target: wp.array3d(dtype=real),
-    trajectory: TrajectoryArrays,
+    trajectory: rows.TrajectoryArrays,
 ):
     """Run a rollout of policy and physics steps in every world, with one thread per world.
 
@@ -65,26 +53,28 @@ def rollout_kernel(
         t = step / timing.substeps
         row = step / timing.every
         if step == row * timing.every:
-            base = load_row_base(trajectory, row, world, com)
+            base = rows.load_row_base(trajectory, row, world, com)
             for k in range(legs.shape[0]):
-                legs[k].angles = row_vec3(trajectory.q, row, 7 + 3 * k, world)
-                legs[k].rates = row_vec3(trajectory.qd, row, 6 + 3 * k, world)
+                legs[k].angles = rows.row_vec3(trajectory.q, row, 7 + 3 * k, world)
+                legs[k].rates = rows.row_vec3(trajectory.qd, row, 6 + 3 * k, world)
         if step == t * timing.substeps:
             for k in range(legs.shape[0]):
-                filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, filtered_target)
+                rows.filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, filtered_target)
             for i in range(6):
                 drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
-        arrived = arrival(step, timing.substeps, delay)
+        arrived = rows.arrival(step, timing.substeps, delay)
         for k in range(legs.shape[0]):
-            torque = leg_torque(commands, actuation, filtered_target, arrived, k, world, legs[k].angles, legs[k].rates)
-            store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
+            torque = rows.leg_torque(
+                commands, actuation, filtered_target, arrived, k, world, legs[k].angles, legs[k].rates
+            )
+            rows.store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
         base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts)
         for k in range(legs.shape[0]):
             trajectory.impulse[step, k, world] = work.impulse[k, world]
             trajectory.pressed[step, k, world] = wp.uint8(legs[k].pressed)
         if step + 1 == (row + 1) * timing.every:
-            store_row_base(trajectory, row + 1, world, com, base)
+            rows.store_row_base(trajectory, row + 1, world, com, base)
             for k in range(legs.shape[0]):
-                store_row_vec3(trajectory.q, row + 1, 7 + 3 * k, world, legs[k].angles)
-                store_row_vec3(trajectory.qd, row + 1, 6 + 3 * k, world, legs[k].rates)
+                rows.store_row_vec3(trajectory.q, row + 1, 7 + 3 * k, world, legs[k].angles)
+                rows.store_row_vec3(trajectory.qd, row + 1, 6 + 3 * k, world, legs[k].rates)

@@ -142,7 +142,7 @@ def test_kernel_writes_each_motors_torque_and_nothing_else():
     target = rng.uniform(-4.0, 4.0, (12, num_worlds))
     joint_f = wp.full(num_worlds * DOFS, 7.0, dtype=float, device="cpu")  # 7: entries that must not change
     arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel())]
-    wp.launch(actuator.motor_torque_kernel, (12, num_worlds), [*arrays, COORDS, DOFS, motors], [joint_f], device="cpu")
+    wp.launch(actuator.motor_torque_kernel, (12, num_worlds), [*arrays, motors], [joint_f], device="cpu")
 
     pos, vel = q[:, MOTOR_COORDS].T, qd[:, MOTOR_DOFS].T
     # the torque law of the tests above, in NumPy
@@ -177,7 +177,7 @@ def test_gradients_equal_central_differences():
 
     def torques():  # [N m] joint_f of the present inputs and motors
         joint_f = wp.zeros(num_worlds * DOFS, dtype=wp.float64, device="cpu", requires_grad=True)
-        arguments = [*inputs.values(), COORDS, DOFS, motors]
+        arguments = [*inputs.values(), motors]
         wp.launch(actuator64.motor_torque_kernel, (12, num_worlds), arguments, [joint_f], device="cpu")
         return joint_f
 

@@ -167,7 +167,7 @@ def launch(module, target, q, qd, params, offset=None, requires_grad=False):
     offset = wp.zeros(target.shape, dtype=module.real, device="cpu") if offset is None else offset
     safe = wp.zeros(target.shape, dtype=module.real, device="cpu", requires_grad=requires_grad)
     dim = (4, target.shape[1])
-    wp.launch(module.command_filter_kernel, dim, [0, target, q, qd, COORDS, DOFS, offset, params], [safe], device="cpu")
+    wp.launch(module.command_filter_kernel, dim, [0, target, q, qd, offset, params], [safe], device="cpu")
     return safe
 
 

@@ -8,30 +8,3 @@ factors have the type of their arrays, bfloat16 on a GPU. No kernel uses atomics
 samples is written as one partial sum per split of the samples, and `optimiser.sum_partials` adds the splits in a fixed
 order.
 """
-
-from jumper_warp.rl.fused.kernels.layers import (
-    layer_backward,
-    layer_forward,
-    network_backward,
-    network_forward,
-    weight_gradients,
-)
-from jumper_warp.rl.fused.kernels.losses import actor_loss, critic_loss
-from jumper_warp.rl.fused.kernels.optimiser import adam_step, prepare_step, sum_partials
-from jumper_warp.rl.fused.kernels.rollout import observe, record_step, sample_action
-
-__all__ = [
-    "actor_loss",
-    "adam_step",
-    "critic_loss",
-    "layer_backward",
-    "layer_forward",
-    "network_backward",
-    "network_forward",
-    "observe",
-    "prepare_step",
-    "record_step",
-    "sample_action",
-    "sum_partials",
-    "weight_gradients",
-]

@@ -1,33 +1,26 @@
 """Make the pictures of the policies' pages from their commands in `policy_pages.toml`.
 
-python experiments/policy_pictures.py --names vertical_jump/picture
+python -m docs.policy_pictures vertical_jump/picture
 """
 
 from __future__ import annotations
 
 import io
 import shlex
+import sys
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 
+from experiments.support.policy_results import PAGES
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.policies.catalog import add_files
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
-from support.policy_results import PAGES
-from support.scripts import run_script
 
 PICTURES: dict[str, dict[str, str]] = PAGES["pictures"]  # Command and the name of its file, by policy/name
-
-
-@dataclass(frozen=True)
-class Args:
-    """Flags of the pictures."""
-
-    names: tuple[str, ...] = tuple(PICTURES)  # Pictures to make, policy/name
 
 
 def webp(path: Path) -> bytes:
@@ -37,15 +30,15 @@ def webp(path: Path) -> bytes:
     return image.getvalue()
 
 
-def main(args: Args) -> list[Path]:
+def main(names: Sequence[str]) -> list[Path]:
     """Run the commands, add the pictures to the policies' folders, and return their paths.
 
     Raises InputError: an unknown name.
     """
-    if unknown := [name for name in args.names if name not in PICTURES]:
+    if unknown := [name for name in names if name not in PICTURES]:
         raise InputError(f"no picture {unknown[0]!r:.40}; there are {', '.join(PICTURES)}")
     written = []
-    for name in args.names:
+    for name in names:
         policy, _, file = name.partition("/")
         with tempfile.TemporaryDirectory() as folder:
             jumper([*shlex.split(PICTURES[name]["command"]), "--out", folder])
@@ -55,4 +48,4 @@ def main(args: Args) -> list[Path]:
 
 
 if __name__ == "__main__":
-    run_script(main, Args)
+    main(sys.argv[1:] or tuple(PICTURES))

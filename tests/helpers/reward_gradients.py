@@ -1,15 +1,14 @@
 """Compare gradients of returns, through rewards and physics with contact, with differences in double precision.
 
-    python experiments/reward_gradients.py --out outputs/reward_gradients
+    python -m tests.helpers.reward_gradients vertical_jump horizontal_jump walking_flat attitude
 
 Robots start a window of policy steps anywhere in episodes of their policy. The gradient of the window's return by all
 actions is compared with central differences along random directions, of a simulation in double precision: the cosine
 over the directions, one for each robot. Windows are counted by contact, and by branches that change between the two
-ends of a difference: paws that touch or leave the ground, pressed stops. Each reward by itself is compared too.
+ends of a difference: paws that touch or leave the ground, pressed stops.
 """
 
-from __future__ import annotations
-
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,25 +18,10 @@ import warp as wp
 
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.gradient_check import GradientCheck
 from jumper_warp.envs.gradients import LoopState, origin_velocity
 from jumper_warp.policies.policy import Policy
-from jumper_warp.viz.plots import figure
-from support.scripts import DeviceArgs, prepare, report, run_script
 
 FRACTION = 0.97  # Of the policy's actions, so that none is at its limit, where the gradient is one-sided
-
-
-@dataclass(frozen=True)
-class Args(DeviceArgs):
-    """Flags of the comparison."""
-
-    policies: tuple[str, ...] = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude")  # Shipped policies
-    num_envs: int = 64  # Number of windows of each policy
-    steps: int = 10  # Policy steps of a window
-    directions: int = 8  # Random directions of the actions
-    change: float = 1.0e-4  # [1] Standard deviation of the changes of the actions
-    seed: int = 0  # Seed of episodes and directions
 
 
 @dataclass
@@ -141,18 +125,28 @@ def _write_compact(joints: torch.Tensor, values: torch.Tensor, base: int) -> Non
     legs[..., [0, 1, 3]] = values[:, base:].unflatten(1, (4, 3)).to(joints.dtype)
 
 
-def compare(env: Env, policy: Policy, args: Args) -> dict[str, np.ndarray]:
-    """Return, for each window: cosine of gradient and differences, contact, changed branches; (num_envs,) each."""
-    window = record(env, policy, args.steps)
+def compare(
+    policy: Policy, num_envs: int = 64, steps: int = 10, directions: int = 8, change: float = 1.0e-4
+) -> dict[str, np.ndarray]:
+    """Return, for each window: cosine of gradient and differences, contact, changed branches; (num_envs,) each.
+
+    change: standard deviation [1] of the changes of the actions.
+    """
+    task = policy.recipe().task.on_level_ground()
+    env = Env(task, num_envs, device="cpu", randomize=False, noise=False)
+    env.reset()
+    with torch.no_grad():
+        for _ in range(60):
+            env.step(FRACTION * policy.act(env.obs) + 0.05 * torch.randn(num_envs, 12))
+    window = record(env, policy, steps)
     simulate = simulated_returns(env, double_rollout(env), window)
-    generator = torch.Generator().manual_seed(args.seed)
+    generator = torch.Generator().manual_seed(0)
     pairs = []
-    changed = np.zeros(env.num_envs, dtype=bool)
-    touched = np.zeros(env.num_envs, dtype=bool)
-    for _ in range(args.directions):
-        direction = args.change * torch.randn(window.actions.shape, generator=generator).to(env.device)
+    changed, touched = np.zeros((2, num_envs), dtype=bool)
+    for _ in range(directions):
+        direction = change * torch.randn(window.actions.shape, generator=generator)
         (high, *above), (low, *below) = (simulate(window.actions + sign * direction) for sign in (1.0, -1.0))
-        pairs.append(((window.gradient * direction).sum((0, 2)).double().cpu().numpy(), 0.5 * (high - low)))
+        pairs.append(((window.gradient * direction).sum((0, 2)).double().numpy(), 0.5 * (high - low)))
         changed |= np.any([(a != b).any((0, 1)) for a, b in zip(above, below, strict=True)], axis=0)
         touched |= above[0].any((0, 1))
     found, expected = np.array(pairs).transpose(1, 0, 2)
@@ -160,42 +154,11 @@ def compare(env: Env, policy: Policy, args: Args) -> dict[str, np.ndarray]:
     return {"cosine": (found * expected).sum(0) / np.maximum(norms, 1.0e-30), "contact": touched, "changed": changed}
 
 
-def main(args: Args) -> dict:
-    """Compare the returns and the single rewards of all policies, plot the cosines, and return the metrics."""
-    folder = prepare("reward_gradients", args)
-    values: dict[str, float] = {}
-    results = {}
-    for name in args.policies:
-        policy = Policy.load(name)
-        task = policy.recipe().task.on_level_ground()
-        env = Env(task, args.num_envs, seed=args.seed, device=args.device, randomize=False, noise=False)
-        env.reset()
-        with env.gradients() as gradients, torch.no_grad():
-            check = GradientCheck(gradients, args.seed)
-            for _ in range(60):
-                env.step(FRACTION * policy.act(env.obs) + 0.05 * torch.randn(env.num_envs, 12, device=env.device))
-                check.every(10)
-        results[name] = windows = compare(env, policy, args)
-        good = windows["cosine"] >= 0.99
-        others = windows["changed"][~good]
-        kinks = check.kinks()
-        values |= {
-            f"{name}_cosine_median": float(np.median(windows["cosine"])),
-            f"{name}_windows_above_0.99_rate": float(good.mean()),
-            f"{name}_windows_with_contact_rate": float(windows["contact"].mean()),
-            f"{name}_others_with_changed_branch_rate": float(others.mean()) if len(others) else 1.0,
-            f"{name}_rewards_checked": float(len(kinks)),
-            f"{name}_rewards_at_kinks_mean_rate": float(np.mean(list(kinks.values()))),
-            f"{name}_rewards_with_faults": float(len(check.faults())),
-        }  # fmt: skip
-    with figure(folder / "cosines.png", title="Gradient of a return against differences") as axis:
-        for name, windows in results.items():
-            axis.step(np.sort(1.0 - windows["cosine"]), np.linspace(0.0, 1.0, args.num_envs), label=name)
-        axis.set(xlabel="1 - cosine", ylabel="share of windows", xscale="log")
-        axis.axvline(0.01, color="grey", linewidth=0.8)
-        axis.legend()
-    return report(args, folder, values, "Gradients of returns against differences in double precision", values)
-
-
 if __name__ == "__main__":
-    run_script(main, Args)
+    for name in sys.argv[1:]:
+        windows = compare(Policy.load(name))
+        cosine = windows["cosine"]
+        branches = windows["changed"][cosine < 0.99].mean() if (cosine < 0.99).any() else 1.0
+        print(f"{name}: {(cosine >= 0.99).mean():.0%} of windows with a cosine of at least 0.99, median "
+              f"{np.median(cosine):.3f}, {windows['contact'].mean():.0%} with contact; of the others {branches:.0%} "
+              "with a changed branch")  # fmt: skip

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import paper_curves, policy_pictures
+from docs import paper_curves, policy_pictures
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_curves_have_a_line_and_a_band_for_each_ablation(tmp_path):
-    picture = paper_curves.main(paper_curves.Args(tmp_path / "curves.webp"))
+    picture = paper_curves.main(tmp_path / "curves.webp")
     assert picture.read_bytes()[8:12] == b"WEBP" and list(tmp_path.iterdir()) == [picture]
 
 
@@ -26,4 +26,4 @@ def test_pages_link_every_picture_of_a_policy():
 
 def test_refuses_the_name_of_an_unknown_picture():
     with pytest.raises(InputError, match="no picture 'vertical_jump/film'"):
-        policy_pictures.main(policy_pictures.Args(("vertical_jump/film",)))
+        policy_pictures.main(["vertical_jump/film"])

@@ -1,11 +1,11 @@
 """Make the tables in docs/ and the policies' pages from files with metrics; nothing is simulated.
 
-    python experiments/policy_tables.py
+    python -m docs.policy_tables
 
 A table stands between two comments, of which the first names it: `main POLICY`, `all POLICY`, `test NAME`, `keys NAME`,
-`choice`, `measured NAME` or `recipe TASK`. `policy_pages.toml` defines columns and tests of policies; their values come
-from the policies' metrics.json. `measured` tables come from docs/results/measurements.json, whose rows have a machine,
-a commit and a date. `recipe` tables come from the trainings of the paper's recipe in docs/results/paper.
+`choice`, `measured NAME` or `recipe TASK`. `experiments/policy_pages.toml` defines columns and tests of policies; their
+values come from the policies' metrics.json. `measured` tables come from docs/results/measurements.json, whose rows have
+a machine, a commit and a date. `recipe` tables come from the trainings of the paper's recipe in docs/results/paper.
 """
 
 from __future__ import annotations
@@ -13,12 +13,22 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.support.policy_results import (
+    CONDITIONS,
+    METRICS,
+    PAGES,
+    RESULTS,
+    TESTS,
+    Row,
+    saved_rows,
+    tasks_of,
+    undefined,
+)
 from jumper_warp.evaluation.attitude import TURN_METRICS
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS, PLACE_METRICS
 from jumper_warp.evaluation.velocities import VELOCITY_METRICS
@@ -27,8 +37,6 @@ from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.metrics import MetricValue, unit_of
-from support.policy_results import CONDITIONS, METRICS, PAGES, RESULTS, TESTS, Row, saved_rows, tasks_of, undefined
-from support.scripts import run_script
 
 BLOCK = re.compile(r"(<!-- table: (?P<name>choice|\w+ [\w. -]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 TABLES: dict[str, Json] = PAGES["tables"]  # Tables of tests by name
@@ -320,12 +328,7 @@ def filled(text: str, tasks: Mapping[str, TaskCfg]) -> str:
     return BLOCK.sub(lambda block: f"{block[1]}\n{make_table(block['name'], tasks)}\n{block[3]}", text)
 
 
-@dataclass(frozen=True)
-class Args:
-    """The script has no flags."""
-
-
-def main(_: Args) -> int:
+def main() -> int:
     """Make the tables of all pages, print the paths of the pages that changed, and return their number."""
     tasks = tasks_of(policy_tasks())
     changed = []
@@ -339,4 +342,4 @@ def main(_: Args) -> int:
 
 
 if __name__ == "__main__":
-    run_script(main, Args)
+    main()

@@ -1,6 +1,6 @@
 """Plot the learning curves of the paper's recipe from docs/results/paper; nothing is trained.
 
-    python experiments/paper_curves.py
+    python -m docs.paper_curves
 
 Lines are means over the seeds, bands their ranges.
 """
@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from experiments.support.policy_results import METRICS, RESULTS
 from jumper_warp.viz.plots import figure
-from support.policy_results import METRICS, RESULTS
-from support.scripts import run_script
 
 TASKS = {
     "vertical-jump-paper": ("success, 0.5–1.2 m", 0.91),
@@ -28,16 +26,9 @@ TASKS = {
 ARMS = ("full", "no_initialisation", "no_estimates", "no_curriculum")
 
 
-@dataclass(frozen=True)
-class Args:
-    """Flags of the plot."""
-
-    out: Path = RESULTS / "paper/curves.webp"  # Picture to write
-
-
-def main(args: Args) -> Path:
+def main(out: Path = RESULTS / "paper/curves.webp") -> Path:
     """Plot the curves, and return the path of the picture."""
-    png = args.out.with_suffix(".png")
+    png = out.with_suffix(".png")
     with figure(png, 1, len(TASKS), figsize=(13.0, 4.4), title="Learning curves of the paper's tasks") as axes:
         for axis, (task, (label, paper)) in zip(axes, TASKS.items(), strict=True):
             for i, arm in enumerate(ARMS):
@@ -56,11 +47,11 @@ def main(args: Args) -> Path:
             axis.set(title=task, xlabel="policy steps [million]", ylabel=label, ylim=(0.0, None))
     image = io.BytesIO()
     Image.open(png).save(image, "webp", quality=88, method=6)
-    args.out.write_bytes(image.getvalue())
+    out.write_bytes(image.getvalue())
     png.unlink()
-    print(args.out)
-    return args.out
+    print(out)
+    return out
 
 
 if __name__ == "__main__":
-    run_script(main, Args)
+    main()
