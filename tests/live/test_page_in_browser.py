@@ -119,6 +119,50 @@ def test_space_makes_the_robot_jump_to_the_height(visitor):
     visitor.keyboard.press(" ")
     assert abs(landing_error(visitor, jumps)) < 0.02
     assert "0.90 m asked" in visitor.locator("#figures").inner_text()
+    assert visitor.evaluate("page.scene.ghost.visible")
+    visitor.locator("#height").press("End")
+    assert visitor.locator("#height-value").inner_text() == "1.10 m"
+    visitor.keyboard.press(" ")
+    assert not visitor.evaluate("page.scene.ghost.visible")
+    visitor.wait_for_function("page.state.phase === 1")
+    visitor.keyboard.press("r")
+    visitor.wait_for_function("page.state.phase === undefined && !document.getElementById('figures').textContent")
+    visitor.locator("#height").fill("0.9")
+
+
+def test_new_target_walk_and_reset_clear_what_a_far_target_showed(visitor):
+    hint, figures = visitor.locator("#hint"), visitor.locator("#figures")
+    distance = "page.scene.camera.position.distanceTo(page.scene.orbit.target)"
+    first = visitor.evaluate(distance)
+    visitor.mouse.click(*window_point(visitor, 2.5, 0.1))
+    assert "Too far" in hint.text_content() and "m away" in figures.text_content()
+    visitor.wait_for_function("page.state.waiting")
+    visitor.mouse.click(*window_point(visitor, 0.9, 0.1))
+    assert "Too far" not in hint.text_content()
+    visitor.keyboard.press("d", delay=200)  # [ms]
+    visitor.wait_for_function("!page.state.waiting")
+    assert figures.text_content() == ""
+    visitor.mouse.wheel(0, 500)
+    visitor.wait_for_function(f"{distance} > {first + 0.5}")
+    visitor.mouse.click(*window_point(visitor, 2.5, 0.1))
+    visitor.wait_for_function("page.state.waiting && document.getElementById('figures').textContent")
+    visitor.keyboard.press("r")
+    visitor.wait_for_function(f"Math.abs({distance} - {first}) < 0.1")
+    visitor.wait_for_function("!document.getElementById('figures').textContent")
+    assert "Too far" not in hint.text_content()
+
+
+def test_fallen_robot_stays_above_the_ground_until_reset(visitor):
+    visitor.evaluate("page.send('push', { force: [0, 400, 0], seconds: 0.3 })")
+    visitor.wait_for_function("page.state.fallen")
+    height = visitor.evaluate("page.state.height")
+    assert "It fell" in visitor.locator("#hint").text_content()
+    assert visitor.locator("#status").text_content() == "fell"
+    visitor.wait_for_timeout(500)  # [ms]
+    assert visitor.evaluate("page.state.fallen") and visitor.evaluate("page.state.height") == height > 0.05
+    visitor.keyboard.press("r")
+    visitor.wait_for_function("!page.state.fallen && page.state.height > 0.35")
+    assert "It fell" not in visitor.locator("#hint").text_content()
 
 
 def test_gamepad_walks_turns_jumps_pushes_and_resets(visitor):
@@ -256,5 +300,6 @@ def test_phone_walks_and_jumps_by_touch(browser, address, visitor):
         phone.locator("#speed").tap()  # scrolls to it
         assert phone.locator("#speed-value").inner_text() == "0.55 ×"
         phone.locator("#speed").fill("1")
-        phone.locator("summary").tap()
+        phone.touchscreen.tap(300, height - 150)  # beside the settings: closes them only
+        assert not phone.evaluate("panel.open || page.state.waiting")
     assert phone.errors == [] or all("GPU stall" in error for error in phone.errors)

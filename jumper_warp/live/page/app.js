@@ -4,16 +4,19 @@ import { Scene } from "./scene.js";
 
 const PUSH = [70, 0.2]; // [N], [s] of the push key
 const SLIP = 0.15; // [m/s] mean speed of the fastest paw on the ground from which a walk slips
-const HINT = matchMedia("(pointer: coarse)").matches
-  ? "Tap the ground: the robot jumps there. The stick walks."
-  : "Click the ground: the robot jumps there. <kbd>W</kbd><kbd>A</kbd><kbd>S</kbd><kbd>D</kbd> walk, <kbd>space</kbd> jumps up.";
+const TOUCH = matchMedia("(pointer: coarse)").matches;
+const HINTS = [ // before the first jump, before the second, and after it
+  TOUCH ? "Tap the ground: the robot jumps there. The stick walks."
+    : "Click the ground: the robot jumps there. <kbd>W</kbd><kbd>A</kbd><kbd>S</kbd><kbd>D</kbd> walk, <kbd>space</kbd> jumps up.",
+  "Drag turns the view, wheel or pinch zooms, click the robot to jump up.", "",
+];
 const PLANETS = { Earth: 9.81, Mars: 3.71, Moon: 1.62 };
 const $ = (id) => document.getElementById(id);
 const meters = (x, digits = 2) => `${x.toFixed(digits)} m`;
 
 const scene = new Scene($("view"));
 const worker = new Worker("physics.js", { type: "module" });
-const page = { scene, send, state: null, jumps: [], times: null, script: [] }; // also for tests and measurements
+const page = { scene, send, state: null, jumps: [] }; // also for tests
 window.page = page;
 let name = "plain";
 let dark = (localStorage.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
@@ -30,13 +33,19 @@ function say(text, time = 6000, kind = "") {
   clearTimeout(notice);
   $("hint").innerHTML = text;
   $("hint").className = kind;
-  if (time) notice = setTimeout(() => say(HINT, 0), time);
+  if (time) notice = setTimeout(hint, time);
 }
 
-function distance([x, y]) {
-  const [px, py] = page.state.position;
-  return Math.hypot(x - px, y - py);
+const hint = () => say(HINTS[Math.min(page.jumps.length, 2)], 0);
+
+// Clear numbers, messages and ghost of the last jump; small: text below the number.
+function clear(small = "") {
+  figure("", small);
+  scene.showJump(null);
+  hint();
 }
+
+const distance = ([x, y]) => Math.hypot(x - page.state.position[0], y - page.state.position[1]);
 
 const ready = () => info && page.state?.skill === "walk" && !page.state.fallen;
 const wait = () => info && say("Wait until it stands.", 1500);
@@ -47,14 +56,13 @@ const actions = {
   jumpUp: () => {
     if (!ready()) return wait();
     const height = Number($("height").value);
-    figure("…", `${meters(height)} asked`);
-    say(HINT, 0);
+    clear(`${meters(height)} asked`);
     send("jumpUp", { height });
   },
   jumpTo: (place) => {
     if (!ready()) return wait();
     if (distance(place) < info.reach[0]) return say(`Too near: a jump ahead is at least ${meters(info.reach[0], 1)}.`, 3000);
-    figure("…", `${meters(distance(place))} away`);
+    clear(`${meters(distance(place))} away`);
     if (!within(place)) say(`Too far for one jump of ${meters(info.reach[1], 1)}: it walks nearer first.`);
     send("jumpTo", { goal: place });
   },
@@ -67,8 +75,7 @@ const actions = {
   hover: (place) => scene.mark("hover", ready() ? place : null, place && ready() && within(place)),
   reset: () => {
     send("reset");
-    scene.showJump(null);
-    say(HINT, 0);
+    scene.resetView();
   },
 };
 
@@ -82,34 +89,37 @@ const receive = {
     info = data;
     scene.setRobot(data.shapes);
     scene.setGround(data.scene, dark);
-    const [low, high] = data.heights;
-    Object.assign($("height"), { min: Math.max(low, 0.5), max: high - 0.05 });
-    $("height").value = data.scene === "mars" ? 2.5 : 0.9;
-    $("height").oninput();
+    Object.assign($("height"), { min: Math.max(data.heights[0], 0.5), max: (data.heights[1] - 0.05).toFixed(2) });
+    setSlider("height", data.scene === "mars" ? 2.5 : 0.9);
     setSlider("gravity", data.gravity);
     setSlider("friction", data.friction);
     $("names").textContent = data.policies.join(", ");
     $("loading").hidden = true;
     page.opened = data.scene;
-    say(HINT, 0);
+    hint();
   },
   state: (state) => {
     state.slip = 0.9 * (page.state?.slip ?? 0) + 0.1 * state.slip;
-    if (state.fallen && !page.state?.fallen) say("It fell. It stands up in a moment; <kbd>R</kbd> resets at once.", 2500, "bad");
+    const cancelled = page.state?.waiting && !state.waiting && state.skill === "walk";
+    if (cancelled || state.time < page.state?.time) clear(); // time falls at a reset
+    const key = TOUCH ? "Tap Reset" : "Press <kbd>R</kbd>";
+    if (state.fallen && !page.state?.fallen) say(`It fell and starts again in a moment. ${key} to start at once.`, 2500, "bad");
     top = state.phase === 1 ? Math.max(top, state.height) : 0;
     if (top) figure(meters(top), $("small").textContent);
     page.state = state;
+    const motion = `${meters(state.height)} high · ${speed(state.velocity).toFixed(1)} m/s`;
+    $("status").textContent = state.fallen ? "fell" : `${doing(state)} · ${motion}`;
     scene.update(state.poses, 1000 / 60 / state.speed);
     scene.mark("goal", state.goal, state.goal && distance(state.goal) <= info.reach[1]);
   },
   jump: (jump) => {
     page.jumps.push(jump);
     scene.showJump(jump);
+    hint();
     if (!jump.made) figure("no jump", "It stayed on the ground.");
     else if (jump.height) figure(meters(jump.apex, 3), `reached, ${meters(jump.height)} asked`);
     else figure(`${(100 * jump.error).toFixed(1)} cm off`, `${meters(jump.length)} far, ${meters(jump.apex)} high`);
   },
-  times: (times) => { page.times = times; },
   error: ({ text }) => {
     $("loading").hidden = true;
     say(text.replaceAll("<", "&lt;"), 10000, "bad");
@@ -169,7 +179,7 @@ $("theme").onclick = () => {
 
 function paint() {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
-  if (info) scene.setGround(name, dark);
+  scene.setGround(name, dark);
 }
 
 // Run a policy of the visitor's own: files of a folder that `jumper export` wrote.
@@ -178,9 +188,7 @@ async function take(files) {
   const [json, bin] = [find("policy.json"), find("policy.bin")];
   if (!json || !bin) return say("This folder has no policy.json and policy.bin: export the policy again.", 10000, "bad");
   try {
-    const description = JSON.parse(await json.text());
-    const bytes = await bin.arrayBuffer();
-    send("policy", { description, bytes, scene: name });
+    send("policy", { description: JSON.parse(await json.text()), bytes: await bin.arrayBuffer(), scene: name });
   } catch {
     say("policy.json is damaged: export the policy again.", 10000, "bad");
   }
@@ -204,6 +212,11 @@ addEventListener("drop", async (event) => {
 });
 $("files").onchange = () => take([...$("files").files]);
 addEventListener("resize", () => scene.resize());
+addEventListener("pointerdown", (event) => { // a tap beside open settings closes them only
+  if (!TOUCH || !$("panel").open || event.target !== scene.canvas) return;
+  $("panel").open = false;
+  event.stopPropagation();
+}, true);
 const controls = new Controls(scene, $("stick"), actions);
 
 const speed = ([x, y]) => Math.hypot(x, y);
@@ -216,14 +229,8 @@ function doing({ skill, phase, waiting, velocity, slip }) {
 }
 
 function frame(now) {
-  const begin = performance.now();
   controls.poll();
   scene.draw(now);
-  if (page.state && info) {
-    const { velocity, height } = page.state;
-    $("status").textContent = `${doing(page.state)} · ${height.toFixed(2)} m high · ${speed(velocity).toFixed(1)} m/s`;
-  }
-  page.script = [...page.script.slice(-99), performance.now() - begin]; // [ms] of the last frames
   requestAnimationFrame(frame);
 }
 

@@ -9,7 +9,6 @@ const PULL = [600, 40, 160]; // [N/m], [N s/m], [N] of a robot that the visitor 
 const values = { friction: null, payload: 0, gravity: null, speed: 1 }; // null: those of the scene's policies
 const policies = {}; // by name
 const own = {}; // dropped by the visitor, by skill
-const times = []; // [ms] of the last policy steps
 let files;
 let mujoco;
 let scenes;
@@ -67,7 +66,6 @@ function report({ path, ...outcome }) {
 }
 
 function step() {
-  const begin = performance.now();
   if (session.drag && !session.fallen) {
     const { position, velocity } = robot;
     const force = session.drag.map((target, i) => PULL[0] * (target - position[i]) - PULL[1] * velocity[i]);
@@ -75,13 +73,11 @@ function step() {
     session.push(force.map((x) => x * Math.min(1, PULL[2] / size)), 2 * DT);
   }
   session.step();
-  times.push(performance.now() - begin);
-  if (times.length > 1200) times.shift();
   const poses = robot.poses(new Float32Array(7 * robot.model.nbody));
   post("state", {
     poses, skill: session.skill, phase: session.jump?.phase, position: Array.from(robot.position), yaw: robot.yaw,
     height: robot.height, velocity: Array.from(robot.velocity), slip: robot.slip, fallen: session.fallen, speed: values.speed,
-    goal: session.request?.goal ?? session.jump?.goal ?? null, waiting: session.request !== null,
+    goal: session.request?.goal ?? session.jump?.goal ?? null, time: robot.data.time, waiting: session.request !== null,
   }, [poses.buffer]);
 }
 
@@ -114,10 +110,6 @@ const actions = {
     const dropped = await readPolicy(description, bytes);
     own[dropped.skill] = dropped;
     await open(scene);
-  },
-  times: () => {
-    const sorted = times.toSorted((a, b) => a - b);
-    post("times", { count: sorted.length, median: sorted[sorted.length >> 1], p99: sorted[Math.floor(0.99 * sorted.length)] });
   },
 };
 

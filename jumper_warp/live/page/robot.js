@@ -77,7 +77,7 @@ export class Robot {
     mujoco.mj_forward(model, data);
   }
 
-  // Advance a policy step towards motor targets [rad], (12,); without a policy the motors damp.
+  // Advance a policy step towards motor targets [rad], (12,).
   step(targets, policy) {
     const { data, model, mujoco } = this;
     data.xfrc_applied.set(this.push, 6 * this.base);
@@ -85,7 +85,7 @@ export class Robot {
       const { qpos, qvel, qfrc_applied: applied } = data;
       for (let i = 0; i < 12; i++) {
         const rate = qvel[this.v[i]];
-        applied[this.v[i]] = policy ? motorTorque(policy, i, targets[i], qpos[this.q[i]], rate) : -2 * rate;
+        applied[this.v[i]] = motorTorque(policy, i, targets[i], qpos[this.q[i]], rate);
       }
       for (let i = 1; i < 12; i += 3) {
         const [a, b] = [this.v[i], this.v[i + 1]];

@@ -31,9 +31,11 @@ export class Scene {
     this.orbit = new OrbitControls(this.camera, canvas);
     Object.assign(this.orbit, { enablePan: false, minDistance: 1, maxDistance: 12, maxPolarAngle: 1.52, enableDamping: true });
     this.orbit.target.set(0, 0, 0.35);
+    this.orbit.saveState();
     this.ambient = new THREE.HemisphereLight(0xffffff, 0x8a8f94, 1.5);
     this.sun = new THREE.DirectionalLight(0xffffff, 2.4);
     this.sun.castShadow = true;
+    this.sun.position.set(-1.5, 2, 6);
     this.sun.shadow.mapSize.setScalar(slow ? 512 : 1024);
     this.sun.shadow.radius = 5;
     this.sun.shadow.normalBias = 0.02;
@@ -155,6 +157,12 @@ export class Scene {
     this.camera.updateProjectionMatrix();
   }
 
+  // Put the camera to where it is at the start; the next frame moves it to the robot.
+  resetView() {
+    this.orbit.reset();
+    this.position.set(0, 0, 0.4);
+  }
+
   // Draw a frame between the last two policy steps; the camera follows the robot.
   draw(now) {
     const [before, after] = this.states;
@@ -185,7 +193,6 @@ export class Scene {
     if (this.frames.length < 12) return;
     const median = this.frames.sort((a, b) => a - b)[6];
     this.frames = [];
-    this.frameTime = median;
     if (median < SLOW) return;
     if (this.ratio > LEAST) {
       this.ratio = Math.max(LEAST, this.ratio * Math.min(0.8, Math.sqrt(20 / median)));

@@ -31,6 +31,7 @@ export class Session {
     this.robot.reset();
     this.skill = "walk";
     this.command = [0, 0, 0];
+    this.jump = null;
     this.request = null; // the jump that the visitor wants: height [m] or goal [m]
     this.fallen = false;
     this.pushSteps = 0;
@@ -54,8 +55,7 @@ export class Session {
   step() {
     const { robot } = this;
     if (this.pushSteps > 0 && --this.pushSteps === 0) robot.push.fill(0);
-    if (this.fallen) {
-      robot.step(null, null);
+    if (this.fallen) { // the pose stays: links do not touch the ground, and the robot would sink into it
       this.fallenTime += DT;
       if (this.fallenTime > FALL_TIME) this.reset();
       return;
