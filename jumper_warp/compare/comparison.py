@@ -29,7 +29,8 @@ from jumper_warp.utils.files import Json
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
 
-PRIMARY = (*SUCCESSES, "success_termination_rate", *(f"-{name}" for name in ERRORS))
+OVERALL = [name for name in (*SUCCESSES, "success_termination_rate", *ERRORS) if not name.startswith("in_range_")]
+PRIMARY = tuple(f"-{name}" if name in ERRORS else name for name in OVERALL)
 """Default primary metrics, of which the first one that an evaluation has counts; -: smaller is better."""
 Values = dict[str, np.ndarray]  # Metrics of an arm by name, one value a seed
 

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.courses import JUMP_TIMEOUT, SLEW_RATE, CourseLog, active_spans, course_metrics
+from jumper_warp.evaluation.courses import JUMP_TIMEOUT, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.skills import JUMP_TO, JUMP_UP, WALK
+from jumper_warp.evaluation.velocities import SLEW_RATE
 from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step

@@ -325,7 +325,7 @@ def test_load_state_dict_resumes_bitwise():
         ({"num_steps": 0}, "num_steps must be in 1 to 10000, got 0"),
         ({"lr": 1.0}, "min_lr <= lr <= max_lr"),
         ({"hidden": ()}, "hidden must name"),
-        ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
+        ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got 'gelu'"),
         ({"clip": float("nan")}, "clip must be in 1e-06 to 100, got nan"),
     ],
 )
