@@ -23,13 +23,13 @@ run. A simulation whose package is missing, or that diverges, is skipped with on
 from __future__ import annotations
 
 import dataclasses
-import functools
 import importlib.metadata
 import itertools
 import time
 import timeit
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -52,14 +52,15 @@ SINK = 1.0e-4  # [m] Depth of the paws in the ground at the start
 SPEED_WEIGHT = 0.1  # [s] Weight of the vertical velocity in the scalar
 OFFSETS = np.random.default_rng(0).uniform(-0.03, 0.03, 12)  # [rad] Offsets at which gradients are taken
 DOUBLE_STEPS = 10.0 ** -np.arange(3.0, 9.0)  # [rad] Steps of differences in double precision
-SINGLE_STEPS = 10.0 ** -np.arange(1.0, 3.1, 0.5)  # [rad] Steps of differences in single precision
-STEP = 1.0e-6  # [rad] Step of MuJoCo's differences as a method, chosen in advance
+SINGLE_STEPS = 10.0 ** -np.arange(1.5, 3.1, 0.5)  # [rad] Steps of differences in single precision
+STEP = 3.0e-6  # [rad] Step of MuJoCo's differences as a method, chosen in advance and not among those above
 HORIZON = 288  # Number of physics steps for which MJX is compiled
 PACKAGES = ("mujoco", "mujoco-mjx", "mujoco-warp", "newton", "warp-lang", "jax")
+KINDS = ("mujoco", "semi_implicit", "featherstone", "featherstone_fresh")  # of Newton's solvers
 MOTORS = np.array(MOTOR_DOFS) + 1  # Indices of the motors in Newton's joint coordinates
 
 
-@functools.cache
+@cache
 def pose(pushing: bool) -> np.ndarray:
     """Return Newton's 43 joint coordinates in the default pose, or at the end of the push-off."""
     robot = load_description()
@@ -144,7 +145,7 @@ def load_mjcf() -> tuple[Any, Any]:
     spec = mujoco.MjSpec.from_file(str(ASSETS / "jumper" / "jumper.xml"))
     spec.compiler.discardvisual = True
     model = spec.compile()
-    model.opt.tolerance = 0.0
+    model.opt.tolerance = 1.0e-12
     model.key_qpos[0, 2] -= SINK
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -182,7 +183,7 @@ class Mjx(Simulation):
         jax, mjx, solver = (import_module(name) for name in ("jax", "mujoco.mjx", "mujoco.mjx._src.solver"))
         jax.config.update("jax_enable_x64", True)
         if iterations > 1:
-            jax.lax.while_loop = functools.partial(solver._while_loop_scan, max_iter=iterations)
+            jax.lax.while_loop = partial(solver._while_loop_scan, max_iter=iterations)
         model, data = load_mjcf()
         model.opt.iterations, model.opt.ls_iterations = iterations, 20
         model.opt.tolerance = 1.0e-8 if iterations == 1 else 0.0
@@ -301,16 +302,10 @@ def resident_memory() -> int:
 
 
 SIMULATIONS: dict[str, Callable[[], Simulation]] = {
-    "ours": lambda: Ours(double=True),
-    "ours_single": lambda: Ours(double=False),
-    "mujoco": Mujoco,
-    "mjx": lambda: Mjx(iterations=1),
-    "mjx_8_iterations": lambda: Mjx(iterations=8),
-    "newton_mujoco": lambda: Newton("mujoco"),
-    "newton_semi_implicit": lambda: Newton("semi_implicit"),
-    "newton_featherstone": lambda: Newton("featherstone"),
-    "newton_featherstone_fresh": lambda: Newton("featherstone_fresh"),
-}
+    "ours": partial(Ours, double=True), "ours_single": partial(Ours, double=False), "mujoco": Mujoco,
+    "mjx": partial(Mjx, iterations=1), "mjx_8_iterations": partial(Mjx, iterations=8),
+    **{f"newton_{kind}": partial(Newton, kind) for kind in KINDS},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -336,10 +331,9 @@ def measure(simulation: Simulation, lengths: tuple[int, ...], repeats: int) -> d
         uncertainty, reference = min(pairs, key=lambda pair: pair[0])
         metrics[f"error_{length}"] = relative(simulation.gradient(length), reference)
         metrics[f"uncertainty_{length}"] = uncertainty
-    forward, gradient = (
-        min(timeit.repeat(functools.partial(call, lengths[-1]), timer=time.process_time, number=1, repeat=repeats))
-        for call in (simulation.forward, simulation.gradient)
-    )
+    timed = partial(timeit.repeat, timer=time.process_time, number=1, repeat=repeats)
+    forward = min(timed(partial(simulation.forward, lengths[-1])))
+    gradient = min(timed(partial(simulation.gradient, lengths[-1])))
     return metrics | {"bytes_a_step": simulation.memory, "forward_s": forward, "cost": gradient / forward}
 
 
