@@ -49,6 +49,7 @@ LEGS = {
 """Bounds of the designs, by what may change: thigh and shank in nominal lengths, stiffness in `STIFFEST`."""
 SCREENED = 512  # Random jumps of which the best are the starts
 SWAP = 20  # Iterations after which shifted copies of the better half of the jumps replace the worse half
+KNOTS = 10  # Times between which the targets of CMA-ES are interpolated, as it needs few unknowns
 MEMORY = "exp_avg", "exp_avg_sq"  # State of Adam
 
 
@@ -162,19 +163,17 @@ class Problem:
             cma: Any = importlib.import_module("cma")
         except ImportError:
             return None
-        first = torch.cat([self.targets[..., 0].flatten(), self.design[:, 0]]).numpy()
-        options = {
-            "popsize": self.args.count,
-            "maxiter": self.args.iterations,
-            "seed": 1 + self.args.seed,
-            "verbose": -9,
-        }
+        knots = np.linspace(0.0, PUSH - 1.0, KNOTS)
+        lines = self.jumps.tensor([np.interp(np.arange(PUSH), knots, row) for row in np.eye(KNOTS)]).T
+        fitted = torch.linalg.lstsq(lines, self.targets[..., 0]).solution
+        first = torch.cat([fitted.flatten(), self.design[:, 0]]).numpy()
+        options = {"popsize": self.args.count, "seed": 1 + self.args.seed, "verbose": -9}
         search = cma.CMAEvolutionStrategy(first, 0.1, options)
         best = torch.full((1,), torch.inf), self.targets[..., :1], self.design[:, :1]
         for _ in range(self.args.iterations):
             points = search.ask()
             values = self.jumps.tensor(np.array(points).T)
-            targets = values[:-3].reshape(PUSH, 4, -1).clamp(*ANGLES)
+            targets = torch.tensordot(lines, values[:-3].reshape(KNOTS, 4, -1), 1).clamp(*ANGLES)
             design = values[-3:].clamp(self.low, self.high)
             with torch.no_grad():
                 cost = self.cost(self.jumps(targets, design)).nan_to_num(1.0e6)
