@@ -36,6 +36,7 @@ from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName, motor_values
 from jumper_warp.utils.files import Json
+from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
 from support.leg_jumps import PUSH, STIFFEST, Jump, Jumps, robot_of
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
@@ -59,7 +60,7 @@ class Args(ThreadArgs):
 
     planets: tuple[str, ...] = ("earth", "mars")  # Planets to jump on
     distances: tuple[float, ...] = (1.0, 2.0)  # [m] Distance of the nominal leg's jump on each planet
-    legs: tuple[str, ...] = ("lengths", "spring", "both")  # Changes of the leg
+    legs: tuple[str, ...] = ("both", "lengths", "spring")  # Changes of the leg
     count: int = 32  # Number of jumps that are optimised in parallel
     iterations: int = 300  # Number of iterations
     evolve: bool = True  # Whether to compare with CMA-ES
@@ -332,6 +333,7 @@ def main(args: Args) -> Json:
     for planet, distance in zip(args.planets, args.distances, strict=False):
         metrics, drawn = solve(planet, distance, args, folder)
         values |= metrics
+        write_metrics(folder, values)
         pictures += drawn
     rows = len(pictures)
     with figure(folder / "codesign.png", rows, 1, figsize=(9, 2.6 * rows), sharex=True, squeeze=False) as axes:
