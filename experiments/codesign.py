@@ -291,7 +291,6 @@ def draw(axis: Any, jump: Flown, design: np.ndarray, title: str) -> None:
         for line, width in zip(points, (6.0, 1.5, 1.5), strict=True):
             color = "C3" if len(line) > 2 else "0.4"
             axis.plot(*(line @ turn + q[[0, 2]]).T, "-", color=color, linewidth=width, alpha=shade)
-    axis.axhline(0.0, color="k", linewidth=1.0)
     axis.set(aspect="equal", ylabel="height [m]", title=title)
 
 
@@ -337,8 +336,10 @@ def main(args: Args) -> Json:
         pictures += drawn
     rows = len(pictures)
     with figure(folder / "codesign.png", rows, 1, figsize=(9, 2.6 * rows), sharex=True, squeeze=False) as axes:
+        x, _, z = np.max([jump.path[:, :3].max(0) for jump, _, _ in pictures], axis=0)
         for axis, picture in zip(axes[:, 0], pictures, strict=True):
             draw(axis, *picture)
+            axis.set(xlim=(-0.6, x + 0.5), ylim=(0.0, z + 0.1))
         axes[-1, 0].set_xlabel("x [m]")
     keys = [key for key in values if key.endswith(("distance_m", "energy_j"))]
     return report(args, folder, values, "Joint optimisation of leg and jump", keys)
