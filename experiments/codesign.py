@@ -49,7 +49,7 @@ LEGS = {
 }  # fmt: skip
 """Bounds of the designs, by what may change: thigh and shank in nominal lengths, stiffness in `STIFFEST`."""
 SCREENED = 512  # Random jumps of which the best are the starts
-SWAP = 20  # Iterations after which shifted copies of the better half of the jumps replace the worse half
+SWAP = 40  # Iterations after which shifted copies of the better half of the jumps replace the worse half
 KNOTS = 10  # Times between which the targets of CMA-ES are interpolated, as it needs few unknowns
 MEMORY = "exp_avg", "exp_avg_sq"  # State of Adam
 
@@ -60,9 +60,9 @@ class Args(ThreadArgs):
 
     planets: tuple[str, ...] = ("earth", "mars")  # Planets to jump on
     distances: tuple[float, ...] = (1.0, 2.0)  # [m] Distance of the nominal leg's jump on each planet
-    legs: tuple[str, ...] = ("both", "lengths", "spring")  # Changes of the leg
-    count: int = 32  # Number of jumps that are optimised in parallel
-    iterations: int = 300  # Number of iterations
+    legs: tuple[str, ...] = ("both", "spring")  # Changes of the leg
+    count: int = 16  # Number of jumps that are optimised in parallel
+    iterations: int = 600  # Number of iterations
     evolve: bool = True  # Whether to compare with CMA-ES
     seed: int = 0  # Seed of the starts
 
