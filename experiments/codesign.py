@@ -10,7 +10,7 @@ each robot, for `jumper train horizontal-jump --robot FOLDER`.
 
 - Links keep their mass per length and cross-section. Body, motor housings, motors and stops stay the same.
 - Energy: positive work of the motors and copper loss, from standing to touchdown. The line from cutoff to no-load speed
-  of a motor gives its loss: torque^2 (no-load - cutoff speed) / peak torque.
+  of a motor gives its loss: torque^2 (no-load - cutoff speed) / peak torque. Springs are loaded in standing for free.
 - Distance: of the base at the height at which the paws touch down, by its ballistic motion after takeoff.
 """
 
