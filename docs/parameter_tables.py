@@ -26,9 +26,11 @@ DOCS = Path(__file__).parent
 PAGES = tuple(
     DOCS / page
     for page in (
-        "reference/robot_parameters.md", "reference/mdp.md", "explanation/randomisation.md",
+        "reference/robot_parameters.md",
+        "reference/mdp.md",
+        "explanation/randomisation.md",
         "explanation/terms_and_kernels.md",
-    )  # fmt: skip
+    )
 )
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.DOTALL)
 TASKS = (
@@ -57,7 +59,7 @@ RANDOMISED = {
 }
 """Fields of `RandomizationCfg` in the table: meaning and unit."""
 FIELD = re.compile(r"(?:\[(?P<unit>.*?)\] )?(?P<meaning>.*?)(?:, (?P<frame>world|body axes|body to world))?")
-"""Comment of a field of `RobotView`."""
+"""Comment of a field of `RobotView`: unit in brackets, meaning, frame."""
 
 
 def number(value: float, digits: int = 5) -> str:
@@ -222,6 +224,7 @@ def robot_view() -> str:
         kind = mdp.RobotView.vars[name].type
         shape = " × ".join(str(size) for size in getattr(kind, "_shape_", ())) or "1"
         field = FIELD.fullmatch(comment)
+        assert field is not None
         return f"`{name}`", shape, field["unit"] or "1", field["frame"] or "", field["meaning"]
 
     docs = field_docs(mdp.RobotView.cls)
