@@ -40,7 +40,7 @@ def contact_at(
 ) -> PawContact:  # fmt: skip
     """Return the contact of paw k with the floor at the solution of a step, with velocity responses to impulses.
 
-    k: 0 to 3. impulse [N s]: body axes. Recomputed from the state at the start of the step, instead of stored.
+    k: 0 to 3. impulse [N s]: body axes. The function recomputes the contact from the state at the start of the step.
     """
     contact = PawContact()
     contact.active = 1

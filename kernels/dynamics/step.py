@@ -1,9 +1,9 @@
 """Parts of a physics step that CPU (`advance`) and GPU (`advance_legs`) share: equations of leg and base, contact.
 
-Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
-its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR); vectors of motors are lateral, outer, inner. Body axes are x
-ahead, y left, z up, those at the start of the step; quaternions are xyzw, body to world. Normals point out of the
-ground, impulses act on the paw.
+The step is semi-implicit Euler: forces and Jacobians are taken at its start, and positions move with the velocities at
+its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR); vectors of motors are lateral, outer, inner. Body axes (x ahead, y
+left, z up) are taken at the start of the step. Quaternions are xyzw, body to world. Normals point out of the ground,
+impulses act on the paw.
 """
 
 import warp as wp

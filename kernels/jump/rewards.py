@@ -25,7 +25,7 @@ REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which 
 
 @wp.func
 def waiting_weight(state: JumpState, waiting_scale: float) -> float:
-    """Return `waiting_scale` between command and takeoff, else 1: the factor on rewards for which no jump is needed."""
+    """Return the factor on rewards that need no jump: `waiting_scale` between command and takeoff, else 1."""
     return wp.where(waiting(state), waiting_scale, 1.0)
 
 
@@ -39,7 +39,7 @@ def just_landed(state: JumpState) -> bool:
 def should_rest(state: JumpState) -> bool:
     """Return whether the robot should stand still: before the jump's command, and from 0.5 s after touchdown.
 
-    In between it must move, to jump or to absorb the landing.
+    Between these times it must move, to jump or to absorb the landing.
     """
     if state.phase == LANDED:
         return state.phase_steps >= REST_STEPS
@@ -296,8 +296,8 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
     """Penalty of decelerating the base in stance: minus deceleration / limit [m/s^2], clamped to -1..0.
 
-    The value is negative, so its weight is positive. `base_deceleration` is minus the deceleration, <= 0. It keeps a
-    squat from ending abruptly.
+    The value is negative, so its weight is positive. `base_deceleration` is minus the deceleration, <= 0. The term
+    keeps a squat from ending abruptly.
     """
     if state.phase != STANCE:
         return 0.0
@@ -416,8 +416,8 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
     """Penalty of changes of motor torque while the robot should rest: sum of their squares [N^2 m^2].
 
-    The change is that from one policy step to the next, each at its last physics step. The base can rest while
-    motors chatter; this term makes them quiet.
+    The change is from the last physics step of one policy step to the last physics step of the next. The base can rest
+    while motors chatter; this term makes them quiet.
     """
     if not should_rest(state):
         return 0.0
@@ -429,7 +429,7 @@ def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> flo
     """Penalty of paw forces that vary within a policy step while the robot should rest.
 
     It is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2; weight_force is
-    the robot's weight. It penalises contact that chatters between two policy steps.
+    the robot's weight. The term penalises contact that chatters within a policy step.
     """
     if not should_rest(state):
         return 0.0

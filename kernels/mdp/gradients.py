@@ -1,6 +1,6 @@
 """Rewards and observations of a policy step as differentiable functions of the robot's state.
 
-Phase machine, events and contacts are constants of a step: the gradient is that of the branch that the step took.
+Phase machine, events and contacts are constants of a step: the gradient belongs to the branch of this step.
 """
 
 from typing import Any

@@ -121,7 +121,7 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the state of a world's robot (`RobotView`) of which only the base is read; motors and paws are 0.
+    """Return the state of a world's robot (`RobotView`) with the values of the base only; motors and paws are 0.
 
     Newton's joint_qd has the velocity of the base's centre of mass and the angular velocity in world axes; the view has
     the velocity of the origin, and the angular velocity in body axes.
@@ -258,7 +258,7 @@ def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
 
 @wp.func
 def angle_from_level(quat: wp.quat, heading: float) -> float:
-    """Return the rotation angle [rad] between an orientation (xyzw) and the level one with a yaw `heading` [rad]."""
+    """Return the angle [rad] between an orientation (xyzw) and the level orientation with a yaw `heading` [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
     turn = wp.quat_inverse(level) * quat
@@ -270,9 +270,9 @@ def in_flight(robot: RobotView, flying: bool, takeoff_speed: float) -> bool:
     """Return whether the robot is in flight after this policy step; flying: the result of the previous step.
 
     A flight begins when no paw is in contact and the base rises faster than takeoff_speed [m/s], 0.75 in the stock
-    jumps: a squat that lifts all paws is no flight. It ends when a paw is in contact and the base does not rise faster
-    than that. Contact at a higher upward speed belongs to the push-off (compliant contact can break during it) or to a
-    clipped edge.
+    jumps: a squat that lifts all paws is no flight. A flight ends when a paw is in contact and the base does not rise
+    faster than takeoff_speed. Contact at a higher upward speed belongs to the push-off (compliant contact can break
+    during it) or to a clipped edge.
     """
     rises = robot.lin_vel[2] > takeoff_speed
     if robot.contacts == 0 and rises:
@@ -293,9 +293,8 @@ def base_deceleration(robot: RobotView) -> float:
     """Return minus the base's deceleration along its previous velocity [m/s^2]; 0 if it speeds up.
 
     Plastic contact can stop the base within a step: the velocity before the step, not the one after, has the direction
-    of the impact.
-    It is a mean of the policy step, <= 0. A rebound does not count: at most the whole previous speed is lost within a
-    policy step.
+    of the impact. The value is a mean of the policy step, <= 0. A rebound does not count: the largest loss in a policy
+    step is the whole previous speed.
     """
     speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:

@@ -126,8 +126,8 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 def clamped_rapid_stepping(robot: RobotView, state: VelocityState, threshold: float, limit: float) -> float:
     """Penalty of rapid stepping: sum over paws of exp(max(0, touchdowns in the last 0.75 s - threshold)) - 1.
 
-    It is clamped to `limit` [1]. It is the paper's form, for its own task: the clamp hides the slope of quick steps, so
-    that our tasks have `rapid_stepping`.
+    The sum is clamped to `limit` [1]. The paper's task uses this form. The clamp removes the slope for quick steps, so
+    our tasks use `rapid_stepping`.
     """
     total = float(0.0)
     for k in range(4):

@@ -1,4 +1,4 @@
-"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to that w.r.t. its inputs.
+"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to the gradient w.r.t. its inputs.
 
 The step solves M (v' - v) = dt f + J^T p for the velocities v' at its end, with impulses p that satisfy the contact law
 R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by v' and z by p, the multipliers l, m are
@@ -7,8 +7,8 @@ R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by 
     m = M^-1 (y + J^T (dR/dv')^T l)
 
 and the gradient with respect to all else, the old velocities aside, is that of m . (dt f + J^T p - M (v' - v)) + l . R
-at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion has a kink; the gradient is that of the
-mode in the forward pass.
+at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion has a kink; the gradient belongs to the
+mode of the forward pass.
 """
 
 import warp as wp

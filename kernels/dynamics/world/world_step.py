@@ -119,9 +119,9 @@ def solve_step(
 
     Writes every leg's pressed stops, contact and motor rates at the end of the step. force [N], moment [N m]: external,
     at the base's com, world axes. impulse: first guess [N s], world axes, (4, num_worlds). legs, contacts: local to the
-    thread, (4,); `angles`, `rates`, `torque` and `pressed` of the legs are read, and all else but `peak_sq` is
-    written. The first set tried is the one of the preceding step or, if that is empty, the stops that the rates at the
-    start would press.
+    thread, (4,); `angles`, `rates`, `torque` and `pressed` of the legs are read, and all else but `peak_sq` is written.
+    The first set is the set of the preceding step or, if it is empty, the stops that the rates at the start would
+    press.
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
