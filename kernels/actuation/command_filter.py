@@ -54,7 +54,7 @@ class FilterParams:
 def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
     """Return how strongly the filter enforces the limits of a motor angle or sum of angles, from 0 (not) to 1 (fully).
 
-    See the module for the rules. command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor
+    See the module for the rules. command, pos [rad], vel [rad/s] of the limited quantity; horizon [s], speed_floor
     [rad/s]: see `FilterParams`.
     """
     upper_margin = limits.upper - pos

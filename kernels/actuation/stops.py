@@ -1,4 +1,4 @@
-"""Hard stops of a leg: of each motor, and of the sum of outer and inner angle.
+"""Hard stops of a leg: stops of each motor, and of the sum of outer and inner angle.
 
 A stop is a spring with a damper on the penetration x = max(0, -gap), taken at the end of the step, that never pulls:
 

@@ -52,8 +52,8 @@ class AttitudeStart:
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
     """Return a copy of `start` for one sampling attempt; in the last attempt its legs are in the default pose.
 
-    The default pose is free of collisions, so that some attempt is valid. A `sample_base` of
-    `mdp.attempts.sample_valid_state`; arrays and rng are unused.
+    The default pose is free of collisions, so that some attempt is valid. `mdp.attempts.sample_valid_state` calls this
+    function as its `sample_base`; arrays and rng are unused.
     """
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1

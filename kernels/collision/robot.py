@@ -1,4 +1,4 @@
-"""Detection of a robot's forbidden contacts: of links or body shell with the ground, and of links with links or shell.
+"""Detection of a robot's forbidden contacts: links or body shell with the ground, and links with links or shell.
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules

@@ -1,6 +1,7 @@
 """Terms of one leg in the equations of motion: inertia, couplings to the base, and bias (velocity, gravity) forces.
 
-With the base's linear acceleration a (of its origin), angular one alpha, and motor accelerations q'' and torques tau:
+With the linear acceleration a of the base's origin, its angular acceleration alpha, motor accelerations q'' and torques
+tau:
 
     D q'' + Bv^T a + Bw^T alpha + h = tau
     force on the base origin  = m a - first x alpha + Bv q'' + F
@@ -226,7 +227,7 @@ def assemble_leg(
 def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
     """Return a leg's inertia, couplings to the base and bias forces for its pose, its motor rates and the base's rate.
 
-    rates [rad/s]: of the motors; omega [rad/s], g [m/s^2]: base rate and gravity, body axes.
+    rates [rad/s] of the motors; omega [rad/s], g [m/s^2]: rotation of the base and gravity, body axes.
     """
     bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
     outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)

@@ -46,7 +46,7 @@ def landing_error_estimate(robot: RobotView, state: JumpState, height: float) ->
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step; takeoff_speed: of `in_flight`."""
+    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step; takeoff_speed: see `in_flight`."""
     flies = in_flight(robot, state.phase == FLIGHT, takeoff_speed)
     if state.phase == STANCE and flies:
         return FLIGHT

@@ -22,7 +22,7 @@ SHELL = wp.constant(vec3(real(0.343), real(0.112), real(-0.049)))  # [m] lower c
 
 @wp.func
 def lacking_sq(height: real, radius: real) -> real:
-    """Return the square of the height [m] by which a sphere of a radius [m] is too low for its margin above the ground."""
+    """Return the squared height [m^2] by which a sphere of a radius [m] is too low for its margin above the ground."""
     lacking = wp.max(MARGIN + radius - height, real(0.0))
     return lacking * lacking
 

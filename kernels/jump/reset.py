@@ -73,7 +73,7 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) -> int:
     """Return the sampled number of policy steps from touchdown to the next goal; 0: there is no further jump.
 
-    delay: range of the number; probability: of a further jump.
+    delay: range of the number; probability of a further jump.
     """
     steps = whole_steps(uniform_range(rng, streams.AGAIN_STEP, delay))
     return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)

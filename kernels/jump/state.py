@@ -54,7 +54,7 @@ def commanded(state: JumpState) -> bool:
 
 @wp.func
 def waiting(state: JumpState) -> bool:
-    """Return whether the robot is still in stance although a jump is commanded: preparing it, or idle."""
+    """Return whether the robot is still in stance although a jump is commanded: it prepares the jump, or is idle."""
     return state.phase == STANCE and state.steps >= state.command_step
 
 

@@ -42,7 +42,7 @@ def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: 
 def damped_ratio(speed: real, lever: real) -> real:
     """Return a thigh's rate [rad/s] for an ankle speed along the shank, damped where thigh and shank nearly align.
 
-    The rate is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s]: of the ankle
+    The rate is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s] of the ankle
     along the shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is below LEVER_FLOOR where thigh
     and shank are within 3.3 degrees of one line, and no bounded rate reaches the speed.
     """

@@ -101,8 +101,8 @@ def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
     """Return a sampled pose and velocity of the base, with a position around `start.spot`.
 
-    The range of the vertical velocity is 0.3 times the range of the horizontal velocities. A `sample_base` of
-    `mdp.attempts.sample_valid_state`.
+    The range of the vertical velocity is 0.3 times the range of the horizontal velocities.
+    `mdp.attempts.sample_valid_state` calls this function as its `sample_base`.
     """
     settings = start.settings
     v = settings.lin_vel

@@ -82,7 +82,7 @@ def make_leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power is differentiated: multipliers, motion, contact.
 
-    rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s]. virtual_rates, law:
+    rates, new_rates [rad/s] of the motors at the start and the end of the step of dt [s]. virtual_rates, law:
     multipliers of the motors' equations and of the contact law. mode: SEPARATE, STICK or SLIDE. pressed: set of pressed
     hard stops. impulse [N s]: on the paw, body axes. push: gradient of the loss w.r.t. the impulse, world axes.
     """

@@ -117,8 +117,8 @@ def filter_gradient(
 ) -> FilterAdjoint:  # fmt: skip
     """Return the gradient of the loss w.r.t. the inputs of a leg's command filter (`filter_leg`) in a policy step.
 
-    Reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at
-    the start of the policy step. Without a filter the gradient passes to the target unchanged.
+    The function reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s] of the
+    leg's motors at the start of the policy step. Without a filter the gradient passes to the target unchanged.
     """
     m = 3 * leg
     adjoint = FilterAdjoint()

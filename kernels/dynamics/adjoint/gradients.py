@@ -186,7 +186,7 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
     """Add the gradient w.r.t. the base's centre of mass, by the chain rule, to its mass and first moment.
 
-    gradient: w.r.t. com [m]. mass [kg]: of the base. The table has the mass and the first moment, mass * com; their
+    gradient: w.r.t. com [m]. mass [kg] of the base. The table has the mass and the first moment, mass * com; their
     quotient is com.
     """
     add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)

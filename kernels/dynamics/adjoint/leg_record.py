@@ -195,7 +195,8 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return recorded matrices of a leg's motor accelerations as a function of the base's; its offset `free` is 0."""
+    """Return the recorded matrices of a leg's motor accelerations by the base's acceleration; `free` is 0.
+    """
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -205,7 +206,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`.
+    """Record the matrices of a leg's motor accelerations as a function of the base's acceleration, without the offset.
 
     The reverse pass solves the transposed equations, with the same matrices and another right-hand side.
     """

@@ -61,7 +61,7 @@ def store_adjoint_scalar(
 ) -> real:
     """Return a scalar whose gradient (`wp.grad`) is the adjoint of `store_row_base`: dot(cotangents, velocities).
 
-    orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
+    orientation (xyzw), lin [m/s], omega [rad/s] of the `BaseState`; com [m]: body frame; cotangents: world axes.
     """
     ang = wp.quat_rotate(orientation, omega)
     return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
@@ -186,7 +186,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Recompute and record the `every` physics steps between two trajectory rows; com [m]: of the base, body frame."""
+    """Recompute and record the `every` physics steps between two trajectory rows; com [m] of the base, body frame."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):

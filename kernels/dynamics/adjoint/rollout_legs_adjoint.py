@@ -180,9 +180,9 @@ def reverse_legs_kernel(
     """Backpropagate through the physics steps of a range of trajectory rows (`span`), with a thread per leg.
 
     Launch over (count rounded up to a multiple of 8, 4). Before the launch, gradients.q and gradients.qd have the
-    gradient w.r.t. the row after the span; after the launch, w.r.t. its first row. Adds the gradients w.r.t. the
-    parameters of base, gravity and filter. count: number of worlds, from `settings.first` on; threads beyond the last
-    world repeat it and write nothing.
+    gradient w.r.t. the row after the span; after the launch, w.r.t. its first row. The kernel also adds the gradients
+    w.r.t. the parameters of base, gravity and filter. count: number of worlds, from `settings.first` on; threads beyond
+    the last world repeat it and write nothing.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)

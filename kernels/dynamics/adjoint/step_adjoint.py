@@ -43,8 +43,8 @@ def add_leg_gradient(
     """Add the gradient of leg k's virtual power w.r.t. its motors to `legs`, and w.r.t. its parameters to `sums`.
 
     Also writes the gradient w.r.t. the motors' torques to `legs`: dt times the multipliers, since torques enter the
-    equations as dt f. dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters; of
-    the two friction coefficients the step depends on the one in `mu_row`.
+    equations as dt f. dt: duration of the step [s]. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t.
+    parameters. mu_row: row of the friction coefficient in this step.
     """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:
@@ -64,8 +64,8 @@ def reverse_step(
 
     adj: gradient w.r.t. the base's state at the end. legs (4,): gradients w.r.t. `angles` and `rates` at the end are
     replaced by those at the start, `torque` is written, the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t.
-    parameters, added to. first_impulse: as in `Commands`. trajectory, cotangent: of the rollout, and the gradient
-    w.r.t. it. record: written by `replay_step`.
+    parameters, added to. first_impulse: as in `Commands`. trajectory of the rollout; cotangent: gradient w.r.t. the
+    trajectory. record: written by `replay_step`.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]

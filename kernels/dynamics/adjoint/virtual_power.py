@@ -181,9 +181,9 @@ def link_motion(
 ) -> FrameMotion:
     """Return motion and virtual velocity of a link's frame, in its axes, from the motion of its leg's motor housing.
 
-    origin [m], vel [m/s], acc [m/s^2], virtual velocity: of the link frame's origin relative to the housing, in housing
+    origin [m], vel [m/s], acc [m/s^2], virtual velocity of the link frame's origin relative to the housing, in housing
     axes; the last three in the five-bar's plane, (x, z). about_y: the link's rate [rad/s], acceleration [rad/s^2] and
-    virtual rate about +y. cosine, sine: of the link's rotation about +y.
+    virtual rate about +y. cosine, sine of the link's rotation about +y.
     """
     w = housing.ang
     link = FrameMotion()
@@ -263,8 +263,8 @@ def housing_motion(
 ) -> FrameMotion:
     """Return motion and virtual velocity of a leg's motor housing frame, in housing axes.
 
-    rate [rad/s]: of the lateral motor. omega [rad/s], g [m/s^2]: of the base, body axes. c, s: cosine and sine of the
-    housing's rotation about body x.
+    rate [rad/s] of the lateral motor. omega [rad/s], g [m/s^2]: rotation of the base and gravity, body axes. c, s:
+    cosine and sine of the housing's rotation about body x.
     """
     zero = real(0.0)
     lateral_rate = geo.side * rate
@@ -300,7 +300,7 @@ def contact_action(
     """Return the virtual power of one paw's contact in a step, for the reverse pass to differentiate.
 
     The power is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
-    orientation (xyzw): of the base, world, at the start of the step dt [s].
+    orientation (xyzw) of the base, world, at the start of the step dt [s].
     """
     centre = pos + wp.quat_rotate(orientation, paw.position)
     normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
@@ -324,8 +324,8 @@ def leg_action(
 ) -> real:  # fmt: skip
     """Return a leg's part of a step's virtual power: links, passive forces, spring and contact, without motor torques.
 
-    mu: friction coefficient. pos [m], orientation (xyzw): of the base, world. omega: its angular velocity [rad/s], g:
-    gravity [m/s^2], both in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
+    mu: friction coefficient. pos [m], orientation (xyzw) of the base, world. omega [rad/s] of the base and gravity g
+    [m/s^2] are in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
     """
     zero = real(0.0)
     pose = leg_pose(geo, angles)

@@ -174,8 +174,8 @@ def completed_step(
 ) -> LegState:  # fmt: skip
     """Return a thread's state after a completed physics step, from its state `old` before it and the step's results.
 
-    base, angles [rad], rates [rad/s]: at the end. torque [N m]: of the motors in the step. total [N s]: sum of the
-    paws' impulses. pressed: set of hard stops that the leg presses.
+    base, angles [rad], rates [rad/s]: values at the end. torque [N m] of the motors in the step. total [N s]: sum of
+    the paws' impulses. pressed: set of hard stops that the leg presses.
     """
     new = old
     new.base = base
@@ -218,7 +218,8 @@ def advance_leg(
     """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other stops for a retry.
 
     A world that has completed all its steps keeps its state, but computes the step, since all threads of a warp must
-    exchange values. params, motors: of this thread's leg. writes: whether this thread moves its world's block.
+    exchange values. params, motors: constants of this thread's leg. writes: whether this thread moves its world's
+    block.
     """
     dt = settings.dt
     blocks = model.ground.blocks.shape[0] > 0

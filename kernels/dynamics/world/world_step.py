@@ -93,10 +93,10 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Replace each leg's active set of hard stops by the one its new rates require; return whether any set changed.
+    """Replace each leg's active set of hard stops by the set that its rates require; return whether any set changed.
 
-    After many tries (`one_by_one`) only one stop of one leg changes. slack [rad/s]: a stop changes only beyond it;
-    sets: number of sets tried in this step.
+    After many tries (`one_by_one`) only one stop of one leg changes. slack: a stop changes only if a rate exceeds it
+    [rad/s]; sets: number of sets tried in this step.
     """
     changed = bool(False)
     for k in range(legs.shape[0]):
