@@ -195,8 +195,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return the recorded matrices of a leg's motor accelerations by the base's acceleration; `free` is 0.
-    """
+    """Return the recorded matrices of a leg's motor accelerations by the base's acceleration; `free` is 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
