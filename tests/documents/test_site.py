@@ -45,7 +45,7 @@ def test_every_public_name_and_stock_term_is_described_once_and_linked(types_and
 @pytest.mark.parametrize(
     "row",
     [
-        r"| `lin_vel` | vec3 | \[m/s\] | base origin, world |",
+        r"| `lin_vel` | vec3 | \[m/s\] | velocity of the base origin, world |",
         r"| `torque` | array2d of float, `(12, num_worlds)` | \[N m\] | last physics step |",
         r"| `body_com` | array of vec3, `(21 num_worlds,)` | \[m\] | body axes |",
         r"| `time_out` | option | `False` |",
