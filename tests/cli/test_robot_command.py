@@ -21,8 +21,3 @@ def test_new_folder_of_a_robot_is_checked_and_drawn(tmp_path, capsys):
     assert (tmp_path / "out" / "robot.png").is_file() and (tmp_path / "out" / "jump.rrd").is_file()
     with pytest.raises(UsageError, match="exists"):
         run(["new", str(tmp_path / "mine")])
-
-
-def test_other_words_are_refused_in_one_line():
-    with pytest.raises(UsageError, match="expected jumper robot new, check or show"):
-        run(["make"])

@@ -61,7 +61,7 @@ def test_resume_continues_the_seeds(folder, logs, capsys):
     assert {path.name for path in folder.glob("seed_*/checkpoints/*2.pt")} == {"iteration_000002.pt"}
 
 
-@pytest.mark.parametrize("content", ["[]", "{", '{"train": {"task": 3, "seed": 1, "tags": 5}}'])
+@pytest.mark.parametrize("content", ["{", '{"train": {"task": 3, "seed": 1, "tags": 5}}'])
 def test_list_runs_leaves_out_folders_with_damaged_settings(content, capsys, tmp_path):
     damaged = tmp_path / "push" / "one"
     damaged.mkdir(parents=True)

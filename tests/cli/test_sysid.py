@@ -92,11 +92,7 @@ def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ([], "recorded motions come first"),
-        (["nowhere.npz"], "nowhere.npz"),
-        (["."], "no npz or csv file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--exclude", "kd,kq"], "unknown parameter 'kq' to exclude"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be in 1e-06 to 90 deg"),
     ],
