@@ -1,8 +1,5 @@
 """Gymnasium: autoreset modes, vector wrappers, one-world environments, statistics of episodes."""
 
-import copy
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
@@ -192,11 +189,3 @@ def test_end_of_an_episode_is_explained():
         env.step(ACTIONS[0, 0])
     env.reset()
     env.step(ACTIONS[0, 0])
-
-
-@pytest.mark.parametrize("copied", [pickle.dumps, copy.deepcopy])
-def test_pickle_and_deep_copy_are_refused_with_the_reason(copied):
-    for envs in (vector(), GymEnv(Env(TASK, 1, device="cpu"))):
-        envs.reset()
-        with pytest.raises(TypeError, match=r"Env can be neither copied nor pickled: .*make another one"):
-            copied(envs)

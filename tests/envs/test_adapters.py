@@ -4,15 +4,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils import env_checker
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
-from jumper_warp.gym import env_id
-from jumper_warp.registry import TASKS, make_task
+from jumper_warp.registry import make_task
 from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.rl.training_run import LEARNING, PERF
@@ -48,21 +46,6 @@ def assert_same(first, second):
 # ---------------------------------------------------------------- Gymnasium: spaces and data
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_task_is_registered_with_gymnasium(task):
-    spec = gymnasium.spec(env_id(task))
-    assert (spec.kwargs, spec.vector_entry_point) == ({"task": task}, "jumper_warp.gym:make_vector_env")
-    assert spec.entry_point == "jumper_warp.gym:make_env"
-
-
-def test_gymnasium_makes_the_named_task():
-    envs = gymnasium.make_vec("jumper_warp/VerticalJump-v0", num_envs=2, device="cpu", seed=7, all_groups=True)
-    assert isinstance(envs, GymVectorEnv)
-    assert (envs.env.task.name, envs.env.num_envs, envs.env.seed) == ("vertical-jump", 2, 7)
-    assert set(envs.single_observation_space) == {"actor", "critic"}
-    assert envs.spec.id == "jumper_warp/VerticalJump-v0"
-
-
 @pytest.mark.parametrize("all_groups", [False, True])
 def test_step_results_are_in_their_spaces(all_groups):
     envs = GymVectorEnv(jumper(), all_groups=all_groups)
@@ -81,16 +64,6 @@ def test_step_results_are_in_their_spaces(all_groups):
     assert all(row in space for row in finals)
 
 
-def test_checks_of_gymnasium_pass():
-    envs = GymVectorEnv(jumper(1))
-    for space, kind in ((envs.single_observation_space, "observation"), (envs.single_action_space, "action")):
-        getattr(env_checker, f"check_{kind}_space")(space)
-        env_checker.check_space_limit(space, kind)
-    for name in ("reset_return_type", "reset_seed_determinism", "reset_options", "seed_deprecation",
-                 "reset_return_info_deprecation", "returned_data_not_reused"):  # fmt: skip
-        getattr(env_checker, f"check_{name}")(envs)
-
-
 @pytest.mark.parametrize("tensors", [False, True])
 def test_step_results_are_copies(tensors):
     envs = GymVectorEnv(jumper(), tensors=tensors)
@@ -102,20 +75,6 @@ def test_step_results_are_copies(tensors):
     played(envs, actions[13:])
     for value, copy in zip(results, copies, strict=True):
         np.testing.assert_array_equal(value, copy)
-
-
-def test_a_reward_that_is_not_finite_is_replaced():
-    envs = GymVectorEnv(jumper())
-    envs.reset()
-    original = envs.env.step
-
-    def step(action):
-        result = original(action)
-        result.reward[0] = torch.nan
-        return result
-
-    envs.env.step = step
-    assert envs.step(ACTIONS[0])[1][0] == 0.0
 
 
 # ---------------------------------------------------------------- Gymnasium: episodes
@@ -195,16 +154,6 @@ def test_reset_with_a_seed_equals_a_new_environment_with_it(resample_at):
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
 
 
-def test_reset_with_a_seed_returns_worlds_to_their_first_task():
-    env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
-    env.reset()
-    env.episodes.skill.zero_()
-    env.request(1)
-    env.reset(seed=5)
-    assert env.episodes.skill.numpy().tolist() == [1, 0]
-    assert env.episodes.requested_task.numpy().tolist() == [-1, -1]
-
-
 def test_equal_seeds_reproduce_and_others_differ():
     envs = GymVectorEnv(jumper())
     first, other, again = (envs.reset(seed=seed)[0] for seed in (5, 6, 5))
@@ -213,45 +162,7 @@ def test_equal_seeds_reproduce_and_others_differ():
     assert (envs.reset()[0] != first).any(axis=1).all()  # without a seed the random numbers continue
 
 
-# ---------------------------------------------------------------- Gymnasium: refusals
-
-
-@pytest.mark.parametrize("actions", [np.zeros((N, 11)), np.full((N, 12), "1")])
-def test_refuses_invalid_actions(actions):
-    envs = GymVectorEnv(jumper())
-    envs.reset()
-    with pytest.raises(ValueError, match=rf"actions must be numbers of shape \({N}, 12\), got "):
-        envs.step(actions)
-
-
 # ---------------------------------------------------------------- rsl-rl
-
-
-def test_rsl_rl_gets_the_observation_groups():
-    env = jumper()
-    adapter = RslRlVecEnv(env, metrics_every=100)
-    obs, extras = adapter.reset()
-    assert (obs.batch_size, extras) == (torch.Size([N]), {})
-    assert torch.equal(obs["actor"], env.obs) and torch.equal(obs["critic"], env.critic_obs)
-    obs, reward, done, extras = adapter.step(torch.from_numpy(ACTIONS[0]))
-    assert (obs["actor"].shape, obs["critic"].shape) == ((N, env.num_obs), (N, env.num_critic_obs))
-    assert reward.shape == done.shape == extras["time_outs"].shape == (N,)
-    assert done.dtype == torch.long
-
-
-def test_rsl_rl_trains_on_the_environment(one_thread):
-    torch.manual_seed(0)
-    env = jumper()
-    adapter = RslRlVecEnv(env, metrics_every=SMALL.num_steps)
-    adapter.reset()
-    before = env.episodes.step_count.numpy().copy()
-    runner = OnPolicyRunner(adapter, rsl_rl_config(SMALL, 100, 0), log_dir=None, device="cpu")
-    old = [p.detach().clone() for p in runner.alg.actor.parameters()]
-    runner.learn(2, init_at_random_ep_len=True)
-    new = list(runner.alg.actor.parameters())
-    assert all(p.isfinite().all() for p in new)
-    assert any(not torch.equal(a, b) for a, b in zip(old, new, strict=True))
-    assert (env.episodes.step_count.numpy() - before == 2 * SMALL.num_steps).all()
 
 
 def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):

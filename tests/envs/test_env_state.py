@@ -146,15 +146,6 @@ def test_an_environment_continues_bitwise_with_sampled_ground():
             assert (moved[(sliding["exists"] == 1) & (sliding["mass"] < 1.0e3)] > 1e-3).any()
 
 
-def test_a_saved_state_does_not_change_with_the_environment():
-    env = make_env(2)
-    state = env.state_dict()
-    copies = {name: value.clone() for name, value in state.items()}
-    env.step(torch.ones((2, 12)))
-    assert equal(state, copies)
-    assert all(value.device.type == "cpu" for value in state.values())
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -40,18 +40,3 @@ def test_a_captured_step_is_one_launch(monkeypatch):
         with counted(monkeypatch) as counts:
             env.step(action)
         assert counts == {"capture_launch": 1}
-
-
-def test_steps_and_resets_reuse_the_environments_arrays():
-    env = make_env(N, randomize=True, noise=True)
-
-    def addresses():
-        tensors = [env.reward, env.done, env.timeout, env.actions, *env.skills[0].obs.values()]
-        arrays = [env.sim.state.joint_q, env.robot.torque, env.parameters.push, env.skills[0].states]
-        return [t.data_ptr() for t in tensors] + [array.ptr for array in arrays]
-
-    before = addresses()
-    for action in random_actions(N, 20):
-        env.step(action)
-    env.reset()
-    assert addresses() == before

@@ -282,8 +282,6 @@ def test_a_command_in_the_request_is_given_at_the_handover():
     first, _ = JUMP.layout("actor")["wanted_height"]
     np.testing.assert_allclose(env.skills[0].obs["actor"][CHOSEN, first], commands[CHOSEN, 2], rtol=1e-6)
     assert not env.episodes.has_command.numpy()[CHOSEN].any() and (env.episodes.skill.numpy()[8:] == 1).all()
-    with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
-        env.request(0, CHOSEN, np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
@@ -329,23 +327,15 @@ def test_metrics_and_configuration_contain_all_skills():
     assert config["handovers"][0]["when"].endswith(":jump_requested")
 
 
-# ---------------------------------------------------------------- refusals
-
-
 @pytest.mark.parametrize(
     ("make_env", "message"),
     [
         (lambda: Env([HOLD, HOLD], N), "unique names, got .*'hold-height', 'hold-height'"),
         (lambda: Env([JUMP, HOLD], N, skill=2), "skill must be an index below 2, got 2 to 2"),
-        (
-            lambda: Env([JUMP, HOLD], N, skill=np.zeros(N + 1, dtype=int)),
-            r"skill must be .* 16 ints, got int64 of shape \(17,\)",
-        ),
         (lambda: Env([JUMP, make_task("horizontal-jump")], N, handovers=[TO_JUMP]), "hold-height to vertical-jump"),
         (lambda: make(JUMP, HOLD).step(torch.zeros((N, 12))), r"shape \(2, 16, 12\), got \(16, 12\)"),
     ],
 )
 def test_refuses_invalid_skills(make_env, message):
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=message):
         make_env()
-    assert "\n" not in str(caught.value)
