@@ -242,15 +242,6 @@ def test_play_horizontal_jumps_records_distances_and_goals_and_writes_film_and_p
         assert (animation.n_frames, animation.size, picture.size[0]) == (5, (96, 64), 1600)  # 0.23 s at half speed
 
 
-def test_play_walks_for_the_given_time(tmp_path, capsys):
-    args = ["--velocity", "0.5", "0", "0.3", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
-    code, out, _ = run(capsys, "play", "walking_flat", *args)
-    assert code == 0 and "walked" in out and "command yaw rate    0.3" in out
-    series = curves(tmp_path / "robot.rrd")
-    (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command" in name)
-    assert yaw_rate_command == pytest.approx([0.3] * 15)
-
-
 def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     script = tmp_path / "script.json"
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')

@@ -11,7 +11,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned, work
-from jumper_warp.compare.sweep_report import PICTURE, importances
+from jumper_warp.compare.sweep_report import PICTURE
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
 from jumper_warp.utils.errors import InputError
@@ -168,14 +168,6 @@ def test_pruning_ends_a_trial_below_the_median(tmp_path):
     last = open_study(sweep).get_trials()[-1]
     assert last.state.name == "PRUNED"
     assert list(last.intermediate_values) == [1]
-
-
-def test_importances_find_the_parameter_that_matters():
-    study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
-    study.optimize(lambda trial: trial.suggest_float("a", 0, 1) + 0.0 * trial.suggest_float("b", 0, 1), n_trials=60)
-    weights = importances(study)
-    assert weights["a"] > 0.8
-    assert sum(weights.values()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,14 @@
 
 import errno
 import json
-import os
 import shutil
 import socket
 import threading
-from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 
-from jumper_warp.cli.bus_sim import run as bus_sim
 from jumper_warp.cli.export import run as export
 from jumper_warp.deploy import bus, main
 from jumper_warp.deploy.bundle import FILE, Bundle
@@ -183,21 +180,3 @@ def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
     export(["vertical_jump", "--bundle", "--out", str(folder), "--overwrite"])
     assert check_bundle(Bundle(folder)) == []
     assert (folder / "jumper.dbc").read_bytes() == (bundle_folder / "jumper.dbc").read_bytes()
-
-
-def process_state():
-    """Return the scheduling policy of this process, and the line about its locked memory."""
-    status = Path("/proc/self/status").read_text().splitlines()
-    return os.sched_getscheduler(0), next(line for line in status if line.startswith("VmLck"))
-
-
-@pytest.mark.parametrize("end", ["runtime", "robot"])
-def test_process_has_neither_real_time_priority_nor_locked_memory_afterwards(end, bundle_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.stdin", None)
-    before = process_state()
-    flags = ["--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"]
-    if end == "runtime":
-        main.main([str(bundle_folder), *flags])
-    else:
-        bus_sim(flags)
-    assert process_state() == before

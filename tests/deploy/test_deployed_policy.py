@@ -103,24 +103,6 @@ def test_jump_to_a_height_is_that_of_the_environment(environment_apex):
     assert apex == pytest.approx(environment_apex, abs=0.004)  # [m]; 0.877
 
 
-def test_jump_to_a_place_ends_there():
-    policy, robot = onnx_of("horizontal_jump"), simulated_robot(12.0)
-    place = robot.joint_q()[0, XY] + [0.8, 0.2]  # [m]
-    for tick in range(180):  # 3 s
-        goal = way_to(place, robot) if tick >= COMMAND_STEP else np.zeros(2)
-        robot.set_targets(policy.targets({**robot_readings(robot), "goal": goal}))
-        robot.step()
-    assert np.linalg.norm(robot.joint_q()[0, XY] - place) < 0.03  # [m]
-
-
-def test_interface_has_first_column_end_and_history_of_each_observation_term():
-    layout = onnx_of("horizontal_jump").interface["observation_layout"]
-    assert [f"{name} {term['first']} {term['end']} {term['history']}" for name, term in layout.items()] == [
-        "goal 0 2 1", "height 2 3 1", "lin_vel 3 15 4", "ang_vel 15 27 4", "gravity 27 39 4", "angle 39 87 4",
-        "rate 87 99 1", "last_action 99 147 4",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("name", "goal", "heading"),  # goal: position and height [m], heading [rad]
     [("vertical_jump", (0.0, 0.0, 0.9), 0.5), ("horizontal_jump", (0.8, 0.2, 0.0), 1.0)],
@@ -307,10 +289,3 @@ def test_jump_command_ends_with_the_landing():
     # next flight
     steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (0.9, 2), (-1.0, 0), (-1.0, 1), (0.9, 0)]
     assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize("module", ["deploy.policy", "policies.spec"])
-def test_module_imports_neither_torch_nor_warp(module):
-    code = f"import sys, jumper_warp.{module}\nprint([m for m in ('torch', 'warp', 'newton') if m in sys.modules])"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"

@@ -258,25 +258,6 @@ def test_an_evaluation_starts_all_worlds_in_the_default_pose(env):
 # ---------------------------------------------------------------- reproducibility and solvers
 
 
-def run(env, actions):
-    """Return observations, final observations, rewards and ends of all steps, a list of four tensors a step."""
-    trace = []
-    for action in actions:
-        env.step(action)
-        trace += [env.obs.clone(), env.final_obs.clone(), env.reward.clone(), env.done.clone()]
-    return trace
-
-
-def test_hundred_steps_are_bitwise_equal_for_equal_seeds_only():
-    actions = random_actions(N, 100)
-    first, again, other = (
-        run(make_env(N, seed=seed, noise=True, randomize=True), actions) for seed in (11, 11, 12)
-    )  # fmt: skip
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    assert not torch.equal(first[0], other[0])
-    assert sum(done.sum() for done in first[3::4]) > 10
-
-
 def test_standing_has_the_same_pose_and_reward_on_both_solvers():
     """The robot stands for half a second."""
     ends = []

@@ -1,8 +1,6 @@
 """User-defined task `hold_height`: training, its state and terms, and loading its saved configuration with its file."""
 
 import importlib.util
-import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,7 +14,6 @@ from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.torch.ppo import Ppo
-from jumper_warp.tasks.saving import task_from_json, task_to_json
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/helpers/hold_height.py"
@@ -160,63 +157,6 @@ def test_user_defined_event_is_sampled_at_every_reset_of_a_world():
 
 
 # ---------------------------------------------------------------- saving and loading
-
-FRESH = """
-import importlib.util, json, sys
-import numpy as np
-import torch
-
-sys.modules["hold_height"] = module = importlib.util.module_from_spec(
-    importlib.util.spec_from_file_location("hold_height", sys.argv[1])
-)
-module.__spec__.loader.exec_module(module)
-
-from jumper_warp import registry
-from jumper_warp.envs.env import Env
-from jumper_warp.tasks.saving import task_from_json
-
-with open(sys.argv[2]) as file:
-    task = task_from_json(json.load(file), [module])
-env = Env(task, 8, seed=1, device="cpu")
-env.reset()
-rewards = []
-for action in torch.from_numpy(np.load(sys.argv[3])):
-    env.step(action)
-    rewards.append(env.reward.numpy().copy())
-np.save(sys.argv[4], rewards)
-"""
-"""Code of a process that loads the task from its file and its saved configuration, and saves the rewards of a run."""
-
-
-def python(code: str, *arguments: Path, path: Path | None = None) -> str:
-    """Run code in a new process and return its output; path: additional folder of modules."""
-    paths = [str(ROOT), *([str(path)] if path else [])]
-    environment = {"PYTHONPATH": ":".join(paths), "PATH": "", "HOME": str(Path.home())}
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "assets", env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-@pytest.fixture
-def saved(tmp_path) -> Path:
-    """Return a JSON file of the task with a changed reward term."""
-    task = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
-    path = tmp_path / "task.json"
-    path.write_text(json.dumps(task_to_json(task)))
-    return path
-
-
-def test_a_task_loaded_in_a_new_process_gives_the_same_rewards(saved, tmp_path):
-    actions = 0.5 * (2.0 * torch.rand((150, N, 12), generator=torch.Generator().manual_seed(0)) - 1.0)
-    np.save(tmp_path / "actions.npy", actions.numpy())
-    python(FRESH, FILE, saved, tmp_path / "actions.npy", tmp_path / "rewards.npy")
-    env, ended = make_env(task=task_from_json(json.loads(saved.read_text()), [hold_height])), 0.0
-    for action, expected in zip(actions, np.load(tmp_path / "rewards.npy"), strict=True):
-        env.step(action)
-        ended += env.done.sum()
-        np.testing.assert_array_equal(env.reward, expected)
-    assert ended >= N and len(np.unique(expected)) == N
 
 
 def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch, request):

@@ -171,13 +171,3 @@ def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
     before = course.switch_step[0, 1] - 1
     expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
     np.testing.assert_allclose(course.marks()["goals"][0], expected)
-
-
-def test_series_and_columns_report_robot_state():
-    course, _ = run_course()
-    series = course.named(course.series(), [1])
-    assert series["vx/actual, robot 2 [m/s]"] == pytest.approx(0.4)  # command and error of `ScriptedEnv`
-    assert series["vx/command, robot 2 [m/s]"] == pytest.approx(0.3) == course.marks()["commands"][1, 0]
-    assert course.named(course.states(), [1]) == {"skill/robot 2": "walk"}
-    assert course.columns()["commands_done"] == [3, 3]
-    assert SimpleNamespace(**course.notes([0])).scripts[0][1] == ["jump_up", 0.75]

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from docs.policy_tables import MEASURED, filled, main_table, pages
+from docs.policy_tables import MEASURED, filled, pages
 from experiments import measure_policies
-from experiments.measure_policies import payload_overlay, run_test, with_trials
+from experiments.measure_policies import payload_overlay, with_trials
 from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
@@ -20,7 +20,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from metric_helpers import saved_metrics
 from support import policy_results
-from support.policy_results import CONDITIONS, TESTS, saved_rows, tasks_of, undefined
+from support.policy_results import CONDITIONS, saved_rows, tasks_of, undefined
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -78,35 +78,6 @@ def test_measured_rows_have_machine_commit_and_date_and_their_tables_are_on_page
         for row in table["rows"]:
             assert row["machine"] and len(row["cells"]) == len(table["columns"]), row
             assert re.fullmatch(r"[0-9a-f]{8}", row["commit"]) and date.fromisoformat(row["date"]), row
-
-
-def test_performance_and_seeds_have_no_table_without_a_file():
-    for page in pages():
-        text = re.sub(r"<!-- table:.*?<!-- end of table -->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-        sections = re.split(r"^## ", text, flags=re.MULTILINE)
-        typed = [part.splitlines()[0] for part in sections if re.search(r"^\|", part, re.MULTILINE)]
-        assert "Seeds" not in typed
-    assert page.stem != "performance" or typed == []
-
-
-def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):
-    lines = main_table("vertical_jump", tasks["vertical_jump"]).splitlines()
-    titles, error = ([cell.strip() for cell in line.split("|")[1:-1]] for line in (lines[0], lines[4]))
-    row = next(row for row in saved_rows("vertical_jump") if (row.condition, row.seed) == ("randomised", 0))
-    values = dict(zip(titles, error, strict=True))
-    assert values[""] == "error [m]" and values["paper, simulation"] == "0.0400"
-    assert values["paper, robot"] == "0.0230 / 0.0100"
-    assert values["randomised"] == f"{row.metrics['apex_error_abs_mean_m'].value:.4f}"
-
-
-def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
-    calls = []
-    monkeypatch.setattr(measure_policies.subprocess, "run", lambda command, **_: calls.append(command))
-    run_test("horizontal_jump", "side_friction_0.4", tmp_path, ["--seed", "1"])
-    assert calls[0][1:6] == ["-P", "-m", "jumper_warp", "evaluate", "horizontal_jump"]
-    assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
-    assert all((POLICIES.parents[1] / test["command"].split()[0]).is_file() or test["command"].startswith("jumper ")
-               for test in TESTS.values() if "command" in test)  # fmt: skip
 
 
 # ---------------------------------------------------------------- the experiment

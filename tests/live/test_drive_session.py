@@ -8,9 +8,6 @@ import pytest
 
 from drive_helpers import session_of
 from jumper_warp.evaluation.skills import SkillNames
-from jumper_warp.live.plots import Plots, series_of
-from jumper_warp.utils.errors import InputError
-from jumper_warp.viz.viser import open_server
 
 
 @pytest.fixture(scope="module")
@@ -145,12 +142,6 @@ def test_fallen_robot_is_reset(session):
     assert abs(session.position[1]) < 0.1
 
 
-def test_reward_terms_of_the_active_task_have_values(session):
-    advance(session, 0.1)
-    terms = {name: value for name, value in session.series().items() if name.startswith("reward of ")}
-    assert all(np.isfinite(value) == name.startswith("reward of velocity-flat/") for name, value in terms.items())
-
-
 def test_policy_that_only_jumps_is_commanded(tmp_path):
     session = session_of(SkillNames().jump_to)
     assert list(session.kinds()) == ["jump there"]
@@ -179,22 +170,3 @@ def test_task_without_sliders_takes_the_values_of_its_labels():
     session.env.command([0.0, 0.0, 0.0, 1.0])
     advance(session, 0.2)
     assert np.isfinite(session.poses).all()
-
-
-def test_undefined_commanded_values_are_absent_from_a_plot_and_do_not_set_its_range(session):
-    server = open_server(0)
-    plots = Plots(server, session, every=3)
-    curves = plots.curves("height")
-    assert np.isnan(curves["commanded"]).all()
-    assert np.isfinite(curves["base"]).all()
-    assert curves["time [s]"][[0, -1]] == pytest.approx([-4.95, 0.0])  # a full axis from the beginning
-    _, base, commanded = series_of(curves)
-    assert (commanded["auto"], commanded["width"]) == (False, 0)
-    assert "auto" not in base
-    server.stop()
-
-
-@pytest.mark.parametrize("port", [-1, 65536])
-def test_a_port_out_of_range_is_refused(port):
-    with pytest.raises(InputError, match="port must be in 0 to 65535"):
-        open_server(port)
