@@ -34,7 +34,6 @@ from jumper_warp.tasks.evaluation import EpisodeMetric
 from jumper_warp.utils.arrays import real_array
 from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
-from jumper_warp.viz.film import write_film
 from jumper_warp.viz.recorder import Recorder
 
 POLICY = POLICIES / "vertical_jump"
@@ -82,7 +81,6 @@ def with_block():
         (lambda env, model: EpisodeMetric("hops_m", "phase", "median"), "statistic"),
         (lambda env, model: train(Recipe(BLIND)), "no observation"),
         (lambda env, model: TerrainCfg(cell=1.0e-9), "10000 cells"),
-        (lambda env, model: register_task("x", lambda: None, aliases="abc"), "aliases"),
         (lambda env, model: BlockCfg((0.9, 0.0), mass=math.inf), "block mass"),
         (lambda env, model: BlockCfg((0.9, 0.0), friction=math.inf), "block friction"),
         (lambda env, model: platform(0.2, size=1e9), "size"),
@@ -90,14 +88,9 @@ def with_block():
         (lambda env, model: uneven(length=1e9), "length"),
         (lambda env, model: RobotOverlay({"base_mass": 8}), "base_mass"),
         (lambda env, model: simulate(Rollout(model), *map(torch.zeros, ((1, 12), 19, 18)), trusted="no"), "trusted"),
-        (lambda env, model: Recorder(model, spacing=math.nan), "spacing"),
-        (lambda env, model: Conditions(gain_scale=1.0), "gain_scale"),
         (lambda env, model: Recorder(model).record(0.0, model.body_q, commands=ZEROS), "commands"),
         (lambda env, model: recorded(model).recording(goals=np.zeros((5, 1, 3))), "goals"),
-        (lambda env, model: recorded(model).recording(goals=np.zeros((1, 1, 2))), "goals"),
         (lambda env, model: recorded(model).save_picture("x.png", true_scale="no"), "true_scale"),
-        (lambda env, model: recorded(model).save_picture("x.png", eye=(math.nan, 0.0, 0.0)), "eye"),
-        (lambda env, model: write_film(recorded(model).recording(), "x.gif", field_of_view=-5.0), "field_of_view"),
         (lambda env, model: LimitsCfg(False, 90.0), "angle lower"),
         (lambda env, model: dataclasses.replace(vertical_jump_filter(), horizon=True), "filter horizon"),
         (lambda env, model: with_block().place_blocks((math.nan, 0.0)), "center"),
@@ -108,9 +101,7 @@ def with_block():
         (lambda env, model: Simulation(2, keep_momentum="no"), "keep_momentum must be True or False"),
         (lambda env, model: Simulation(2).reset([1, 0]), "mask must be bool"),
         (lambda env, model: real_array(np.ma.masked_array(ZEROS, mask=ZEROS == 0.0), "values"), "masked"),
-        (lambda env, model: DeployedPolicy(POLICY / ONNX).act(np.full(147, np.nan)), "observation"),
         (lambda env, model: DeployedPolicy(POLICY / ONNX).filter_targets(ZEROS, np.full(12, np.nan), ZEROS), "angle"),
-        (lambda env, model: DeployedPolicy(POLICY / ONNX).filter_targets(ZEROS, ZEROS, ZEROS + 1j), "rate"),
         (lambda env, model: PpoCfg(epochs=1.5), "ppo epochs must be int"),
         (lambda env, model: train("vertical-jump"), "needs a Recipe"),
         (lambda env, model: TrainCfg(task="../outside"), "task, run_name and tags"),

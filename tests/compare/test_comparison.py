@@ -42,7 +42,7 @@ def test_the_newest_run_of_a_name_and_seed_counts(runs):
     ("sources", "settings", "message"),
     [
         (("bass*", "tuck"), {}, "no such run"),
-        (("*", "tuck"), {}, r"differ in env\.rewards\.jump-height\.weight"),
+        (("2026*", "tuck"), {}, r"differ in env\.rewards\.jump-height\.weight"),
         (("base",), {}, "a comparison needs two arms, got base"),
         (("base", "tuck", ".."), {}, "no run in this folder"),
         (("base", "tuck", "several:7"), {}, "no seed 7; seeds: 1, 2"),

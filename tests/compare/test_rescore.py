@@ -5,16 +5,13 @@ import pytest
 import warp as wp
 
 from closed_pipe import closed_pipe
-from jump_helpers import make_env, random_actions
 from jumper_warp import mdp
 from jumper_warp.cli.main import main
 from jumper_warp.compare.rescore import rescore
 from jumper_warp.compare.tasks import base_of, task_of
-from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from recordings import record_jumps
 
 TASK_FILE = """
 from dataclasses import replace
@@ -39,13 +36,7 @@ def height_reward(robot: mdp.RobotView, state: mdp.JumpState) -> float:
 @pytest.fixture(scope="module")
 def recording():
     """Return a recording of two robots that fall, since their actions are random."""
-    env, log = make_env(2), JumpLog(np.full(2, 0.9), make_task("vertical-jump").termination_names)
-    recorder = EnvRecorder(env, log, [0, 1], notes={"task": "vertical-jump"})
-    actions = iter(random_actions(2, 90))
-    run_evaluation(
-        lambda obs: next(actions), env, log, seconds=1.5, on_begin=recorder.begin, on_step=recorder, stop=False
-    )
-    return recorder.recording()
+    return record_jumps([0.9, 0.9], 90, [0, 1]).recording()
 
 
 def with_reward(*terms):

@@ -10,7 +10,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned, work
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned
 from jumper_warp.compare.sweep_report import PICTURE
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import seed_folders
@@ -77,17 +77,6 @@ def test_trials_of_another_setting_do_not_mix_in_a_sweep(tmp_path, old, new, mes
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=message):
         open_study(read_sweep(path))
-
-
-def test_a_storage_that_fails_in_the_middle_of_a_sweep_is_named(tmp_path):
-    sweep = read_sweep(sweep_file(tmp_path))
-
-    def damage(_):
-        (sweep.folder / "study.db").write_bytes(b"no database" * 1000)
-        raise optuna.TrialPruned("damaged")
-
-    with pytest.raises(InputError, match="storage of sweep two_settings"):
-        work(sweep, damage)
 
 
 def test_the_value_of_a_trial_is_the_mean_of_its_seeds(tmp_path):
@@ -178,7 +167,6 @@ def test_pruning_ends_a_trial_below_the_median(tmp_path):
         ("--num-envs 8", "--run_name=x", "sets --run-name"),
         ("startup_trials = 2", "grace = nan", "grace must be"),
         ("startup_trials = 2", "nothing = 1", "nothing"),
-        ("[parameters]", "[other]", "a sweep needs parameters"),
         ("startup_trials = 2", 'name = "../up"', "name may contain"),
         ("sqlite", "sqlite:////none/none.db", "unable to open"),
         ("Train/mean_episode_length", "Train/mean_episode", "metric must name a logged metric, such as"),
@@ -205,15 +193,6 @@ def test_a_setting_of_workers_that_cannot_be_used_is_named(tmp_path, capsys, fla
         main(["sweep", str(sweep_file(tmp_path)), *flags])
     assert end.value.code == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("line", ["{}", "x"])
-def test_a_damaged_journal_is_refused(tmp_path, line):
-    sweep = read_sweep(sweep_file(tmp_path, storage="journal"))
-    sweep.folder.mkdir()
-    (sweep.folder / "journal.log").write_text(f"{line}\n{line}\n")
-    with pytest.raises(InputError, match="sweep two_settings: "):
-        open_study(sweep)
 
 
 @pytest.mark.parametrize("gpus", [None, "", "3"])

@@ -23,6 +23,7 @@ from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import platform
 from jumper_warp.tasks.terms import RewardTerm
+from randomization_helpers import read
 
 TASK = make_task("vertical-jump")
 N = 32
@@ -151,15 +152,6 @@ def test_starts_in_flight_touchdown_or_landed_do_not_count_for_the_curriculum(en
 # ---------------------------------------------------------------- resets
 
 
-def drawn_of(env) -> dict[str, np.ndarray]:
-    """Return the randomised parameters by name; the world is the last index."""
-    parameters, motors = env.parameters, env.parameters.motors
-    found = {name: getattr(parameters, name).numpy().copy() for name in ("latency", "static_ratio")}
-    found |= {name: getattr(motors, name).numpy().copy() for name in ("kp", "kd", "no_load_speed", "offset")}
-    table = env.sim.dynamics.robot.table
-    return found | {"table": table.numpy().copy(), "push": parameters.push.numpy().T.copy()}
-
-
 def twins(**arguments):
     """Return two equal environments after some equal steps."""
     pair = [make_env(N, seed=5, noise=True, randomize=True, **arguments) for _ in range(2)]
@@ -182,8 +174,9 @@ def test_a_reset_changes_no_other_world():
     np.testing.assert_array_equal(one.sim.joint_q()[rest], other.sim.joint_q()[rest])
     np.testing.assert_array_equal(one.sim.joint_qd()[rest], other.sim.joint_qd()[rest])
     np.testing.assert_array_equal(one.episodes.step_count.numpy()[rest], other.episodes.step_count.numpy()[rest])
-    for name, values in drawn_of(one).items():
-        np.testing.assert_array_equal(values[..., rest], drawn_of(other)[name][..., rest], err_msg=name)
+    drawn = read(other)
+    for name, values in read(one).items():
+        np.testing.assert_array_equal(values[..., rest], drawn[name][..., rest], err_msg=name)
     assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()
 
 

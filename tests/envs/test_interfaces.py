@@ -37,26 +37,6 @@ def test_a_step_does_not_change_the_action(env):
 # ---------------------------------------------------------------- results of a step
 
 
-def test_step_results_are_views_of_the_environments_tensors():
-    """They are overwritten in place and agree with each other."""
-    env = make_env(N, noise=True, randomize=True, seed=3)
-    obs, extras = env.reset()
-    assert obs["actor"] is env.obs and obs["critic"] is env.critic_obs and extras == {}
-    previous, ends = None, torch.zeros(2)
-    for action in random_actions(N, 200):
-        step = env.step(action)
-        assert previous is None or all(a is b for a, b in zip(step, previous, strict=True))
-        previous = step
-        assert step.obs["actor"] is env.obs and step.extras["final_obs"]["critic"] is env.final_critic_obs
-        assert step.reward is env.reward and step.extras["time_outs"] is env.timeout
-        assert step.terminated.dtype == step.truncated.dtype == torch.bool
-        assert torch.equal(step.truncated, env.timeout == 1.0)
-        assert torch.equal(step.terminated, (env.done == 1.0) & (env.timeout == 0.0))
-        ends += torch.stack([step.terminated.sum(), step.truncated.sum()])
-        edit_episodes(env, 0, phase=LANDED, phase_steps=59)
-    assert (ends > 5).all()
-
-
 def test_reward_terms_add_up_to_the_reward():
     env = make_env(N)
     terms = env.reward_terms

@@ -3,7 +3,17 @@ import json
 import numpy as np
 import pytest
 
-from experiments import benchmark_solver, benchmark_training, gradient_cost, new_reward, template
+from experiments import (
+    benchmark_solver,
+    benchmark_training,
+    demo,
+    gradient_cost,
+    leg_springs,
+    new_reward,
+    rescue,
+    template,
+    walk_jump_walk,
+)  # fmt: skip
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
@@ -13,7 +23,7 @@ from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
-from metric_helpers import values
+from metric_helpers import saved_metrics, values
 
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -157,3 +167,51 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     assert values["cpu_ratio"] == pytest.approx(expected)
     for name in ("targets", "q", "qd", "table", "saturation"):
         assert 0.0 < values[f"error_{name}"] < 0.02
+
+
+# ---------------------------------------------------------------- experiments at a tiny size
+
+
+def test_demo_prints_one_summary_of_all_parts_and_writes_a_film(tmp_path, capsys):
+    values = demo.main(demo.Args(num_jumps=3, size=(96, 64), out=tmp_path, device="cpu"))
+    lines, saved = capsys.readouterr().out.splitlines(), saved_metrics(tmp_path)
+    assert len(lines) <= 24 and max(len(line.replace(str(tmp_path), "outputs/demo")) for line in lines) <= 80
+    assert set(saved) == set(values) and all(saved[key].value is not None for key in demo.SUMMARY)
+    vertical = saved_metrics(tmp_path / "vertical_jump")
+    assert saved["vertical_goal_reached_rate"] == vertical["goal_reached_rate"]
+    assert saved["open_loop_apex_height_m"].value == pytest.approx(1.075, abs=0.01)
+    assert saved["filmed_goal_distance_at_rest_m"].value < 0.1
+    for name in ("jump.mp4", "jump.png", "jump.rrd", "open_loop/jump.rrd", "horizontal_jump/sweep.png"):
+        assert (tmp_path / name).stat().st_size > 1000, name
+
+
+def test_springs_raise_the_apex(tmp_path):
+    args = leg_springs.Args(stiffness=(0.0, 500.0), squat_angles=(120.0,), filter="stock", out=tmp_path, device="cpu")
+    values = leg_springs.main(args)
+    assert read_values(tmp_path) == values
+    without, with_springs = values["stock_apex_m"]
+    assert without == pytest.approx(1.075, abs=0.01) and with_springs == pytest.approx(1.243, abs=0.01)
+    assert values["stock_highest_apex_height_m"] == with_springs and (tmp_path / "springs.png").is_file()
+
+
+def test_weak_motor_is_identified_from_a_lost_jump(tmp_path):
+    args = rescue.Args(
+        changes=("weak_motor",), modes=("identified",), count=1, nominal=0, timed=0, candidates=8, threads=1,
+        out=tmp_path, device="cpu",
+    )  # fmt: skip
+    values = rescue.main(args)
+    assert values["weak_motor_identified_smallest_torque_factor"] == pytest.approx(0.5, abs=0.05)
+    assert abs(values["weak_motor_identified_added_mass_kg"]) < 0.2
+    assert (tmp_path / "weak_motor" / "identified.rrd").stat().st_size > 10_000
+
+
+def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
+    monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
+    monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
+    values = walk_jump_walk.main(walk_jump_walk.Args(num_robots=2, num_recorded=1, out=tmp_path, device="cpu"))
+    metrics = read_values(tmp_path)
+    assert metrics == values
+    assert metrics["finished_rate"] == metrics["jump_made_rate"] == 1.0
+    assert metrics["apex_error_abs_mean_m"] < 0.05 and metrics["goal_distance_at_handover_mean_m"] < 0.05
+    assert 0.0 < metrics["settled_slewed_rmse_vx_m_s"] < 0.2 and 0.2 < metrics["command_to_takeoff_mean_s"] < 2.5
+    assert (tmp_path / "timeline.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000

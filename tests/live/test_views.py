@@ -7,15 +7,12 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 import rerun as rr
-from PIL import Image
 from rerun.chunk import RrdReader
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jumper_warp.live.checkpoints import watch_checkpoints
-from jumper_warp.live.clips import ROLES, Player
+from jumper_warp.live.clips import ROLES
 from jumper_warp.live.curves import MetricsTail
-from jumper_warp.live.feed import Setup, live_address, start_module
-from jumper_warp.live.films import SIZE, Films
+from jumper_warp.live.feed import live_address, start_module
 from jumper_warp.live.rerun_view import RerunView
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
@@ -145,33 +142,6 @@ def test_a_viewer_without_input_ends():
 def test_a_damaged_address_of_a_live_view_is_none(tmp_path, content):
     (tmp_path / "watch.txt").write_bytes(content)
     assert live_address(tmp_path) is None
-
-
-def test_whole_episodes_after_a_due_iteration_become_a_gif_and_an_event(sim, tmp_path):
-    q = sim.joint_q().astype(np.float32).view(np.int32)
-    columns = 3 + q.shape[1]
-    layout = {"world": (0, 1), "done": (1, 2), "rewards": (2, 3), "joint_q": (3, columns)}
-    setup = Setup(
-        folders=(tmp_path,), titles=("base",), scene=robot_scene(sim.model), layout=layout, terms=("a",), endings=(),
-        state=np.dtype([]), goal="", step_dt=1.0 / 60.0, elapsed=0.0, viewer="none", video_every=10,
-    )  # fmt: skip
-    episodes = np.zeros((30, len(ROLES), columns), dtype=np.int32)  # an episode ends in every twelfth step
-    episodes[..., 0] = range(len(ROLES))
-    episodes[::12, :, 1] = 1
-    episodes[..., 3:] = q
-    players = [Player(layout) for _ in ROLES]
-    films = Films(setup)
-    for iteration in (9, 10, 11):
-        for slot, player in enumerate(players):
-            player.add(episodes[:, slot])
-        films.update(iteration, players)
-    films.end()
-    path = tmp_path / "videos/iteration_000010.gif"
-    with Image.open(path) as film:
-        assert film.size == SIZE and film.n_frames == 3  # 12 steps at 15 images a second
-    events = EventAccumulator(str(path.parent), size_guidance={"images": 0}).Reload()
-    (image,) = events.Images("film")
-    assert image.step == 10 and image.encoded_image_string == path.read_bytes()
 
 
 def test_tail_reads_complete_lines_once(tmp_path):

@@ -89,19 +89,6 @@ def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monk
     assert [path.name for path in folder.parent.iterdir()] == ["jump"]
 
 
-def test_threads_may_write_one_file_at_a_time(tmp_path):
-    contents = [bytes([65 + i]) * 10_000 * (i + 1) for i in range(4)]
-
-    def write(content):
-        for _ in range(50):
-            write_atomically(tmp_path / "file", content)
-            assert (tmp_path / "file").read_bytes() in contents
-
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(write, contents)) == 4 * [None]
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
-
-
 def test_part_of_a_killed_write_is_replaced(tmp_path):
     (tmp_path / "file.part").write_bytes(b"partial and longer")
     write_atomically(tmp_path / "file", b"whole")

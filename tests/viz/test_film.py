@@ -95,17 +95,6 @@ def test_robots_stay_in_view_of_the_default_camera(tmp_path, canvas):
     assert drawn.poses[0][1, 1] - drawn.poses[0][0, 1] == pytest.approx(1.0)  # [m] apart
 
 
-def test_film_of_chosen_worlds_shows_no_other(tmp_path, canvas):
-    goals = np.array([[[1.0, 0.0, 0.0]]] * 3)
-    places = np.stack([walk(1.0)] * 3, axis=1)
-    recording = box_recording(places, spacing=1.0, goals=goals, heights=np.array([0.6, 0.7, 0.8]))
-    write_film(recording, tmp_path / "two.webp", size=SIZE, ranks=[0, 2])
-    (drawn,) = canvas
-    assert {shape.body for shape in drawn.shapes} == {-1, 0, 2}
-    names = {shape.name for shape in drawn.shapes if shape.name != "shape"}
-    assert names == {"goal_0_0", "goal_2_0", "height_0", "height_2"}
-
-
 @pytest.mark.parametrize(("ranks", "message"), [([-1], "rank must be in 0 to 0, got -1"), ([], "number of ranks")])
 def test_film_of_worlds_that_are_not_recorded_is_refused(tmp_path, canvas, ranks, message):
     with pytest.raises(InputError, match=message):
