@@ -180,21 +180,6 @@ def test_a_setting_of_a_sweep_that_cannot_be_used_is_named(tmp_path, capsys, old
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (("--workers", "0"), "workers must be a whole number"),
-        (("--workers", "2", "--slurm", "bogus=1"), "local: Parameter 'bogus'"),
-    ],
-)
-def test_a_setting_of_workers_that_cannot_be_used_is_named(tmp_path, capsys, flags, message):
-    pytest.importorskip("submitit")
-    with pytest.raises(SystemExit) as end:
-        main(["sweep", str(sweep_file(tmp_path)), *flags])
-    assert end.value.code == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("gpus", [None, "", "3"])
 def test_a_worker_sees_the_gpus_of_its_parent_and_does_not_ignore_ctrl_c(tmp_path, monkeypatch, gpus):
     """As it would in a script's `jumper sweep FILE --workers 2 &`; submitit hides all GPUs."""

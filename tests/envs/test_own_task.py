@@ -5,15 +5,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 import hold_height
 from columns import Z
-from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.torch.ppo import Ppo
+from velocity_helpers import edit
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/helpers/hold_height.py"
@@ -31,14 +30,6 @@ def make_env(num_envs=N, task=None, **arguments) -> Env:
 def states_of(env) -> np.ndarray:
     """Return a copy of the task states of all worlds, a structured array."""
     return env.skills[0].states.numpy().copy()
-
-
-def edit(env, worlds=slice(None), **fields) -> None:
-    """Overwrite fields of the states of worlds."""
-    records = states_of(env)
-    for name, value in fields.items():
-        records[name][worlds] = value
-    env.skills[0].states.assign(records)
 
 
 # ---------------------------------------------------------------- training and terms
@@ -154,19 +145,3 @@ def test_user_defined_event_is_sampled_at_every_reset_of_a_world():
     others = np.arange(N) != 3
     assert (torques[1:, :, others] == torques[:-1, :, others]).all() and (torques[1:, :, 3] != torques[:-1, :, 3]).all()
     assert (make_env(task=task, randomize=False).sim.motors.saturation.numpy() == nominal.astype(np.float32)).all()
-
-
-# ---------------------------------------------------------------- saving and loading
-
-
-def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch, request):
-    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
-    request.addfinalizer(lambda: sys.modules.pop("level_jump"))
-    registry.load_task_module(str(ROOT / "tests/helpers/level_jump.py"))
-    task = registry.make_task("level-jump")
-    env = Env(task, 4, randomize=False, noise=False, device="cpu")
-    env.evaluation_reset([0.0, 0.0, 0.9])
-    env.step(torch.zeros(4, 12))
-    row = [term.name for term in task.rewards].index("level")
-    # e^0 = 1 of weight 2 over a step of 1/60 s
-    assert env.skills[0].term_value.numpy()[row] == pytest.approx(np.full(4, 2.0 / 60.0), rel=0.05)

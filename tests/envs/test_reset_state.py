@@ -1,4 +1,4 @@
-"""State after a reset: it does not depend on earlier episodes, and motors at rest have no torque."""
+"""State after a reset: independent of earlier episodes and of threads per world; motors at rest have no torque."""
 
 import dataclasses
 
@@ -74,7 +74,7 @@ def test_motors_hold_the_present_angles_until_the_first_action_arrives():
 
 
 def reset_by(env, lanes):
-    """Return coordinates, rates and states of the worlds after a reset with `lanes` threads per world (several: GPUs)."""
+    """Return coordinates, rates and states of the worlds after a reset with `lanes` threads per world."""
     skill = env.skills[0]
     env.sim.state.joint_q.assign(np.tile(env.sim.model.joint_q.numpy()[:43], LANE_WORLDS))
     skill.states.zero_()

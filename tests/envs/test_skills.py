@@ -17,6 +17,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from skill_helpers import begin_hold, begin_jump, hold_requested, jump_requested
+from velocity_helpers import edit
 
 N = 16
 DEG = np.pi / 180.0
@@ -238,9 +239,7 @@ def test_a_new_skill_observes_nothing_from_before_the_handover():
 def test_a_world_switches_at_most_once_a_step_and_not_when_its_episode_ends():
     handovers = (Handover(HOLD, AGAIN, always, keep_holding), Handover(AGAIN, HOLD, always, keep_holding))
     env = make(HOLD, AGAIN, handovers=handovers)
-    records = env.skills[0].states.numpy().copy()
-    records["steps"][2] = 119  # the episode ends in this step, and the next one has the same skill
-    env.skills[0].states.assign(records)
+    edit(env, 2, steps=119)  # the episode ends in this step, and the next one has the same skill
     skills = followed(env, torch.zeros((5, N, 12)))[1]
     rest = np.arange(N) != 2
     assert (skills[:, rest] == np.array([1, 0, 1, 0, 1])[:, None]).all()
@@ -287,9 +286,7 @@ def test_new_episodes_begin_in_the_first_skill_without_requests(begin):
         env.evaluation_reset(np.full((N, 1), 0.3))
     else:
         new = np.arange(N) == 3
-        records = env.skills[0].states.numpy().copy()
-        records["steps"][3] = 10_000  # too long
-        env.skills[0].states.assign(records)
+        edit(env, 3, steps=10_000)  # too long
         env.request(1, new)
         followed(env, torch.zeros((1, N, 12)))
         assert env.done[3]

@@ -159,15 +159,3 @@ def test_robot_that_never_stops_has_outcome_stuck():
         env.steps == 120 + round(JUMP_TIMEOUT / DT)
         and values(course_metrics(course))["command_to_takeoff_mean_s"] is None
     )
-
-
-def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
-    course, env = CourseLog([(SCRIPT[0], ScriptStep("jump_to", (0.5, 0.1)))]), ScriptedEnv(1)
-    course.begin(env)
-    for number in range(200):
-        goal = np.full((1, 3), 0.01 * number)
-        course.read_env = lambda env, goal=goal: env.step() | {"jump_goal": goal}
-        course.record_step(env)
-    before = course.switch_step[0, 1] - 1
-    expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
-    np.testing.assert_allclose(course.marks()["goals"][0], expected)

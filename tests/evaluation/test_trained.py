@@ -13,10 +13,8 @@ from jumper_warp.registry import make_task
 @pytest.mark.parametrize(
     ("task", "flags", "words"),
     [
-        ("velocity-flat", VelocityPlayFlags(velocity=((9.0, 0.0, 0.0),)), "velocity ahead 9 m/s (trained -1.6 to 2.2)"),
         ("velocity-flat", VelocityPlayFlags(velocity=((0.5, -1.5, 2.0), (0.0, 0.0, 0.0))),
          "velocity to the left -1.5 m/s (trained -1 to 1), yaw rate 2 rad/s (trained -1.4 to 1.4)"),
-        ("vertical-jump", HeightPlayFlags((0.9, 3.0)), "height 3 m (trained 0.45 to 1.15)"),
         ("horizontal-jump", LandingPlayFlags(goal=((0.9, 0.0),), next_goals=((0.8, 3.0),)), "distance to the left 3 m"),
     ],
 )  # fmt: skip

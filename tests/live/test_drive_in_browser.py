@@ -108,16 +108,6 @@ def test_click_makes_the_robot_jump_there(page, driver):
     assert np.linalg.norm(page.session.position[:2] - goal) < 0.05
 
 
-def test_pause_and_single_step(page, driver):
-    driver.keyboard.press("p")
-    wait_for(lambda: page.paused)
-    steps = page.steps
-    driver.keyboard.press("n")
-    wait_for(lambda: page.steps == steps + 1)
-    driver.keyboard.press("p")
-    wait_for(lambda: page.steps > steps + 2)
-
-
 async def intrude(page, messages):
     """Connect as another visitor, send messages, and return the texts and the labels of controls that it receives."""
     address = f"ws://127.0.0.1:{page.server.get_port()}"

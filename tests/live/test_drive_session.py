@@ -1,6 +1,5 @@
 """A driven robot: velocities, jumps to clicked places, physical values, pushes, grounds, and other tasks."""
 
-import json
 from dataclasses import astuple
 
 import numpy as np
@@ -151,17 +150,6 @@ def test_policy_that_only_jumps_is_commanded(tmp_path):
     session.jump_to(np.array([1.6, 0.0]))
     advance(session, 3.0)
     assert np.linalg.norm(session.position[:2] - [1.6, 0.0]) < 0.08
-
-
-def test_recipe_file_is_simulated_in_the_default_pose(tmp_path):
-    from jumper_warp.recipe import Recipe
-
-    path = tmp_path / "recipe.json"
-    path.write_text(json.dumps(Recipe.of("velocity-flat").to_json()))
-    session = session_of(str(path), agent="hold")
-    advance(session, 0.5)
-    assert not session.fallen
-    assert session.series()["velocity/ahead [m/s]"] == pytest.approx(0.0, abs=0.05)
 
 
 def test_task_without_sliders_takes_the_values_of_its_labels():

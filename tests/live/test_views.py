@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from jumper_warp.live.checkpoints import watch_checkpoints
 from jumper_warp.live.clips import ROLES
 from jumper_warp.live.curves import MetricsTail
-from jumper_warp.live.feed import live_address, start_module
+from jumper_warp.live.feed import live_address
 from jumper_warp.live.rerun_view import RerunView
 from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
@@ -124,18 +124,6 @@ def test_watch_fails_with_the_process_of_its_viewer(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONHOME", str(tmp_path))  # in which no Python starts
     with pytest.raises(InputError, match="the viewer's process ended with status 1"):
         watch_checkpoints(folder, "cpu", viewer="viser")
-
-
-def test_a_view_is_shown_if_its_address_cannot_be_saved(tmp_path, capfd):
-    folder = train(short_training(tmp_path)).folder
-    (folder / "watch.txt.part").mkdir()
-    watch_checkpoints(folder, "cpu", seconds=0.1, viewer="viser")
-    assert "Traceback" not in capfd.readouterr().err
-
-
-def test_a_viewer_without_input_ends():
-    process = start_module("jumper_warp.live.viewer")
-    assert process.wait(60) == 0
 
 
 @pytest.mark.parametrize("content", [b"http://127.0.0.1:1\n", b"\xff"])
