@@ -58,6 +58,9 @@ def still(tmp_path_factory):
         (["evaluate", "vertical_jump", "--out", "\udcff"], "'\\udcff' is not UTF-8"),
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
         (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "empty value after --log-root"),
+        (["sysid", "x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
+        (["sysid", "x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg)"),
+        (["sysid", "x.npz", "--noise.angle", "0"], "noise angle must be in 1e-06 to 90 deg"),
     ],
 )
 def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkeypatch, args, message):

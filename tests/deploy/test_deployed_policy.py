@@ -64,12 +64,6 @@ def way_to(place, robot):
     return np.array([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x])
 
 
-def simulated_robot(lateral_torque):
-    """Return a simulated robot with motors of 18 N m, lateral ones of `lateral_torque` [N m]."""
-    motors = jumping_motors(18.0, lateral_torque=lateral_torque)
-    return Simulation(1, motors=motors, friction=0.85, device="cpu")
-
-
 @pytest.fixture(scope="module")
 def environment_apex():
     """Apex [m] of the policy's jump to HEIGHT in the environment."""
@@ -129,7 +123,8 @@ def jump(delay=0, ticks=180):
 
     delay: policy steps by which the end of the jump command is delayed; ticks: policy steps to simulate.
     """
-    policy, command, robot = onnx_of("vertical_jump"), JumpCommand(), simulated_robot(10.0)
+    policy, command = onnx_of("vertical_jump"), JumpCommand()
+    robot = Simulation(1, motors=jumping_motors(18.0, lateral_torque=10.0), friction=0.85, device="cpu")
     apex, takeoffs, in_flight, commands = 0.0, 0, False, []
     for tick in range(ticks):
         if tick == COMMAND_STEP:

@@ -25,24 +25,20 @@ def session(walker):
     return walker
 
 
-def advance(session, seconds):
-    """Advance a session by some time [s]; return the largest height of the base [m]."""
+def advance(session, seconds, until=lambda session: False):
+    """Advance a session until a condition holds, at most some time [s]; return the largest height of the base [m]."""
     heights = []
     for _ in range(round(60 * seconds)):
         session.step()
         heights.append(session.position[2])
-    return max(heights)
-
-
-def finish_jump(session, seconds=10.0):
-    """Advance a session until its jump is over, at most some time [s]; return the largest height of the base [m]."""
-    heights = []
-    for _ in range(round(60 * seconds)):
-        session.step()
-        heights.append(session.position[2])
-        if session.jump is None or session.fallen:
+        if until(session):
             break
     return max(heights)
+
+
+def finish_jump(session):
+    """Advance a session until its jump is over; return the largest height of the base [m]."""
+    return advance(session, 10.0, lambda session: session.jump is None or session.fallen)
 
 
 def test_robot_follows_the_commanded_velocity(session):
@@ -131,10 +127,7 @@ def test_robot_begins_anew_on_another_ground(walker):
 
 def test_fallen_robot_is_reset(session):
     session.push(1500.0, 90.0)
-    for _ in range(120):
-        session.step()
-        if session.fallen:
-            break
+    advance(session, 2.0, lambda session: session.fallen)
     assert session.fallen
     advance(session, 1.6)
     assert not session.fallen
