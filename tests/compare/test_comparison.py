@@ -57,11 +57,15 @@ def test_the_newest_run_of_a_name_and_seed_counts(runs):
     assert arm.members[2].folder == newer
 
 
+def test_runs_of_an_arm_must_have_equal_settings(runs):
+    with pytest.raises(InputError, match=r"runs named both differ in env\.rewards\.jump-height\.weight"):
+        find_arms([f"both={runs}"])
+
+
 @pytest.mark.parametrize(
     ("sources", "settings", "message"),
     [
         (("bass*", "tuck"), {}, "no such run"),
-        (("2026*", "tuck"), {}, r"differ in env\.rewards\.jump-height\.weight"),
         (("base",), {}, "a comparison needs two arms, got base"),
         (("base", "tuck", ".."), {}, "no run in this folder"),
         (("base", "tuck", "several:7"), {}, "no seed 7; seeds: 1, 2"),
