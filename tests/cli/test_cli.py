@@ -256,9 +256,3 @@ def test_messages_that_cannot_be_written_do_not_change_the_exit_code(redirection
     command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", word]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
-
-
-def test_info_works_in_a_deleted_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    tmp_path.rmdir()
-    assert run(capsys, "info", "vertical_jump")[0] == 0

@@ -131,6 +131,20 @@ def test_ended_episode_has_to_be_reset_without_automatic_resets():
             envs.step(action)
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_commands_are_resampled_within_an_episode(mode):
+    task, still = make_task("velocity-flat"), np.zeros((N, 12), dtype=np.float32)
+    same, other = (GymVectorEnv(Env(task, N, device="cpu", seed=1, randomize=False), autoreset_mode=each)
+                   for each in (AutoresetMode.SAME_STEP, mode))  # fmt: skip
+    same.reset(), other.reset()
+    command = same.env.task_arrays()["command"]
+    for _ in range(200):  # 3.3 s
+        results = same.step(still), other.step(still)
+        np.testing.assert_array_equal(results[0][0], results[1][0])
+        assert not (results[0][2] | results[0][3]).any()
+    assert (same.env.task_arrays()["command"] != command).any()
+
+
 # ---------------------------------------------------------------- spaces, data and seeds
 
 

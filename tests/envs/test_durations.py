@@ -84,3 +84,8 @@ def test_an_infinite_time_limit_is_saved_and_is_no_time_limit_of_the_metrics():
     task = make_task("vertical-jump").with_terms("terminations", too_long={"steps": math.inf})
     assert task_from_json(task_to_json(task)) == task
     assert task.max_episode_length_s(1.0 / 60.0) == 0.0
+
+
+def test_refuses_more_command_levels_than_int32_holds():
+    with pytest.raises(InputError, match="levels"):
+        dataclasses.replace(make_task("velocity-flat").levels[0], levels=2**32)

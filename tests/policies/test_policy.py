@@ -137,6 +137,11 @@ def test_non_finite_observation_counts_as_zero(bad):
     assert scalar_policy().act(torch.tensor([bad])) == scalar_policy().act(torch.tensor([0.0]))
 
 
+def test_float64_observations_are_clamped_before_conversion():
+    policy = scalar_policy(0.1)
+    assert policy.act(torch.tensor([1.0e300], dtype=torch.float64)) == policy.act(torch.tensor([100.0]))
+
+
 # ---------------------------------------------------------------------- saving and loading
 
 
