@@ -176,8 +176,8 @@ TERMS = [  # (term, numbers, rows (value, robot, episode), phases in which it is
     ("paws_down", {}, [(3.0, {"contact": (1.0, 1.0, 0.0, 1.0), "contacts": 3}, {})], [L]),
     ("squat", SQUAT, squats()),
     ("touchdown_tracking", {"std": 0.1}, [  # 0.1 m away
-        (E(-1.0) * touches, {"pos": (1.06, -2.08, 0.3)}, {"phase": L, "touched_down": touches, "goal": (1.0, -2.0, 0.0)})
-        for touches in (0, 1)]),
+        (E(-1.0) * touches, {"pos": (1.06, -2.08, 0.3)},
+         {"phase": L, "touched_down": touches, "goal": (1.0, -2.0, 0.0)}) for touches in (0, 1)]),
     ("folded_legs", {"angle": 2.0}, [(0.2**2 + 0.4**2, {"angle": FOLDED}, {})], [F]),
     ("tracking", TRACKING, [(value, robot, {"goal": (1.0, -2.0, 0.0)})
                             for (_, robot), value in zip(ON_WAY, TRACKED, strict=True)], [F, L]),
