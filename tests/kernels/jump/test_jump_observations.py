@@ -16,7 +16,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.mirror import mirror_of
 from mdp_helpers import array
 
-S, F, L = PHASES
+_, F, L = PHASES
 HORIZONTAL, VERTICAL = (without_draws(make_task(name)) for name in ("horizontal-jump", "vertical-jump"))
 MOTORS = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]
 SCALES = np.concatenate(  # standard deviations of the noise: [m], [m/s], [rad/s], [1], [rad], [rad/s] by column
