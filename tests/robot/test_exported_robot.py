@@ -174,17 +174,6 @@ def swing_in_mujoco(file):
     return data.joint("FL_outer").qpos[0]
 
 
-def test_mujoco_keeps_all_masses_of_the_urdf_and_the_base_can_be_freed(exported):
-    spec = mujoco.MjSpec.from_file("robot_urdf/jumper.urdf")
-    spec.body("body").add_freejoint()
-    tree = spec.compile()
-    fixed = mujoco.MjModel.from_xml_path("robot_urdf/jumper.urdf")
-    assert (fixed.nv, tree.nq, tree.nv) == (20, 27, 26)
-    for model in (fixed, tree):
-        assert model.body_mass.sum() == pytest.approx(14.5, abs=1e-9)  # [kg]
-        assert model.nbody == 22 and model.nmesh == 4
-
-
 def test_newton_reads_masses_stops_and_loops_from_usd(exported):
     pytest.importorskip("pxr")
     pytest.importorskip("newton_usd_schemas")
