@@ -10,7 +10,6 @@ from columns import Z
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
-from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, ratio, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
@@ -134,12 +133,6 @@ def test_first_half_of_a_motion_has_the_first_residuals_of_the_whole(standing, r
     np.testing.assert_array_equal(part, whole[: len(part)])
 
 
-def test_gram_matches_numpy():
-    rng = np.random.default_rng(0)
-    left, right = rng.normal(size=(101, 7)), rng.normal(size=(101, 3))
-    np.testing.assert_allclose(transposed_product(left, right), left.T @ right, atol=1e-12)
-
-
 def few_parameters():
     """Return kp, kd and offset of leg FL's motors, base mass, latency and knee damping: 12 parameters."""
     wanted = {f"{name}/{joint}" for name in ("kp", "kd", "offset") for joint in ("FL_lateral", "FL_outer", "FL_inner")}
@@ -218,20 +211,6 @@ def test_identify_refuses_a_recording_given_twice(standing):
     for motions in ([motion, motion], [motion, replace(motion, angle=motion.angle + 0.001), copy]):
         with pytest.raises(InputError, match=rf"motions 1 \(standing\) and {len(motions)} .* are the same recording"):
             identify(motions, jumper_parameters())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"parameters": ["latency"]}, "parameters must be ParameterSet"),
-        ({"noise": {"angle": 0.1}}, "noise must be NoiseLevels or None"),
-        ({"dt": "0.001"}, "dt must be float or None"),
-        ({"dt": 0.0}, "dt must lie in 1e-6 to 0.01 s"),
-    ],
-)
-def test_identify_refuses_arguments_of_another_kind(standing, arguments, message):
-    with pytest.raises(InputError, match=message):
-        identify([standing[0].motion], **{"parameters": jumper_parameters(["latency"]), **arguments})
 
 
 def test_identify_refuses_a_robot_that_does_not_move(replay):

@@ -1,4 +1,3 @@
-import os
 import time
 
 import pytest
@@ -39,17 +38,6 @@ def test_runs_of_the_repeated_hour_in_autumn_are_ordered(zone, tmp_path):
     first, second = (tmp_path / run_name(1_000_000 * (AUTUMN + offset)) for offset in (-5400, -3600))
     assert first.name == "2026-10-25_02-30-00_000000+0200" and second.name == "2026-10-25_02-00-00_000000+0100"
     assert newest([first, second]) == second
-
-
-def test_names_without_offset_are_local_time_and_renamed_runs_have_that_of_their_change(zone, tmp_path):
-    zone("Europe/Oslo")
-    renamed = tmp_path / "best"
-    renamed.mkdir()
-    os.utime(renamed, (0, AUTUMN + 1))
-    before = tmp_path / "2026-10-25_03-00-00_999999"
-    after = tmp_path / "2026-10-25_03-00-01_500000_rescued"
-    assert start_time(before) == pytest.approx(AUTUMN + 0.999999, abs=1.0e-4)
-    assert newest([before, renamed]) == renamed and newest([after, renamed]) == after and newest([]) is None
 
 
 def test_resume_latest_continues_the_run_that_started_last(zone, tmp_path):

@@ -45,12 +45,6 @@ def test_mirrored_observation_gives_the_mirrored_action():
     assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1  # f alone is not
 
 
-def test_symmetric_observation_gives_a_symmetric_action():
-    model, x = walker(), torch.randn(64, NUM_OBS)
-    action = model.mean(0.5 * (x + mirrored(x, OBS)))
-    torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)  # motors of legs FL and FR
-
-
 @pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
 def test_expanded_plain_network_has_the_same_output(hidden):
     model, x = walker(hidden), torch.randn(16, NUM_OBS)

@@ -36,10 +36,7 @@ def test_load_overlay_inverts_save(tmp_path):
         ({"values": {"colour": [1.0]}}, "unknown quantity 'colour'"),
         ({"values": {"kp": [1.0]}}, r"kp needs 12 values, got shape \(1,\)"),
         ({"values": {"base_mass": [7000.0]}}, "base_mass must be in 0.001 to 100 kg"),
-        (
-            {"value": {"kp": 12 * [1.1]}},
-            "unknown section 'value'; expected one of schema, source, robot, values",
-        ),
+        ({"value": {"kp": 12 * [1.1]}}, "unknown section 'value'; expected one of schema, source, robot, values"),
         ({"values": {"cutoff_speed": 12 * [60.0]}}, "below the no_load_speed"),
     ],
 )

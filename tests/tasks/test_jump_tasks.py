@@ -6,16 +6,8 @@ import pytest
 
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
-from jumper_warp.tasks.jump.cfg import Level, cross_levels
 
-GOALS = (Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.3, 0.3)), Level((0.0, 0.0, 0.6), (0.0, 0.0, 0.9), (0.3, 0.3)))
 STARTS = ((0.22, 0.35), (0.22, 0.45))  # [m] base heights
-
-
-def test_cross_levels_repeats_all_starts_for_each_level_of_goals():
-    levels = cross_levels(GOALS, STARTS)
-    assert [level.goal_upper[2] for level in levels] == [0.6, 0.6, 0.9, 0.9]
-    assert [level.base_height for level in levels] == [*STARTS, *STARTS]
 
 
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "horizontal-jump-standing", "vertical-jump-mars"])

@@ -13,7 +13,6 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from columns import Y, Z
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
@@ -131,14 +130,6 @@ def test_paw_positions_of_default_pose_by_hand(build):
     # x: 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075; z: five-bar at 45 degrees
     want = [[0.24, 0.1652, -0.3718], [0.24, -0.1652, -0.3718], [-0.24, 0.2102, -0.3718], [-0.24, -0.2102, -0.3718]]
     np.testing.assert_allclose(ankle, want, atol=5.0e-5)
-
-
-def test_positive_lateral_angle_swings_paws_outward_about_the_hip(build):
-    motors = np.tile(np.radians([90.0, 0.0, 0.0]), 4)[:, None]
-    ankle = build.legs_at(motors).ankle[:, 0]
-    # a quarter turn about the hip: out by the leg's 0.4716, and the plane's offset of 0.0602 points up
-    assert ankle[:, Y] == pytest.approx([0.105 + 0.4716, -0.105 - 0.4716, 0.15 + 0.4716, -0.15 - 0.4716], abs=5.0e-5)
-    assert ankle[:, Z] == pytest.approx(0.0602, abs=5.0e-5)
 
 
 # --- Position: reachable targets ---
