@@ -36,13 +36,6 @@ def test_newest_and_best_checkpoints_are_kept(tmp_path):
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
-def test_best_of_equal_scores_is_the_last_saved(tmp_path):
-    for iteration, score in ((300, 1.0), (500, 0.9), (100, 1.0), (200, 0.9)):
-        save_checkpoint(tmp_path, state(iteration), score, max_checkpoints=1)
-    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000100", "iteration_000200"]
-    assert best_checkpoint(tmp_path).stem == "iteration_000100"
-
-
 def test_latest_checkpoint_is_the_last_saved_not_the_highest_iteration(tmp_path):
     for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
         newest = save_checkpoint(tmp_path, state(iteration), max_checkpoints=2)

@@ -33,13 +33,6 @@ def test_runs_are_ordered_by_the_instant_of_their_start(zone, tmp_path):
     assert newest(names.values()) == names["America/New_York"]
 
 
-def test_runs_of_the_repeated_hour_in_autumn_are_ordered(zone, tmp_path):
-    zone("Europe/Oslo")
-    first, second = (tmp_path / run_name(1_000_000 * (AUTUMN + offset)) for offset in (-5400, -3600))
-    assert first.name == "2026-10-25_02-30-00_000000+0200" and second.name == "2026-10-25_02-00-00_000000+0100"
-    assert newest([first, second]) == second
-
-
 def test_resume_latest_continues_the_run_that_started_last(zone, tmp_path):
     for place in ("Europe/Oslo", "America/New_York"):
         zone(place)

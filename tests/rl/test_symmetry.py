@@ -108,15 +108,3 @@ def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):
     obs = torch.randn(30, NUM_OBS)
     torch.testing.assert_close(policy.act(obs), model.act(obs), atol=1e-5, rtol=1e-5)
     assert policy.interface.sizes == (NUM_OBS, 16, 12, 12)
-
-
-def test_symmetric_actor_resumes_only_with_the_same_symmetry():
-    first, second = Ppo(PushTask(8), CFG), Ppo(PushTask(8), CFG)
-    second.load_state_dict(first.state_dict())
-    assert torch.equal(first.flat.value, second.flat.value)
-    wrong = first.state_dict()
-    wrong["model"]["mirror_obs_order"] = wrong["model"]["mirror_obs_order"].flip(0)
-    with pytest.raises(InputError, match="mirror_obs_order is for another observation"):
-        second.load_state_dict(wrong)
-    with pytest.raises(RuntimeError, match=r'Unexpected key\(s\) in state_dict: "mirror_'):
-        Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())

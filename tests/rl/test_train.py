@@ -20,7 +20,7 @@ from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.rl.training_run import TrainingRun
-from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
+from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_twice
 
 
 def make_env(num_envs, seed, device):
@@ -86,44 +86,6 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
     *_, cause, last = capsys.readouterr().err.splitlines()
     assert cause == "ended by an interruption after 0.00 M of 0.05 M steps"
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
-
-
-class InterruptedSave(PushTask):
-    """Task that sends Ctrl-C to this process in the third iteration, and again while its state is saved."""
-
-    def step(self, action):
-        super().step(action)
-        if self.steps == 40:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    def metrics(self):
-        self.send_again()
-        return super().metrics()
-
-    def state_dict(self):
-        self.send_again()
-        return super().state_dict()
-
-    def send_again(self):
-        if self.steps == 48:
-            os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_further_interrupts_do_not_prevent_the_last_checkpoint(cfg):
-    with pytest.raises(SystemExit, match="130"):
-        train(dataclasses.replace(cfg, max_iterations=100), InterruptedSave)
-    assert list(cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt"))
-
-
-def test_two_processes_train_one_policy(cfg, tmp_path):
-    torch.multiprocessing.spawn(train_rank, (free_port(), cfg, str(tmp_path / "rank")), nprocs=2)
-    first, second = (torch.load(tmp_path / f"rank{rank}", weights_only=True) for rank in range(2))
-    assert equal(first["model"], second["model"])
-    assert (first["num_envs"], second["num_envs"]) == (16, 16)
-    assert (first["iteration"], second["iteration"]) == (4, 4)
-    assert first["seed"] != second["seed"]
-    (folder,) = cfg.log_root.glob("push/*")
-    assert equal(load_checkpoint(folder / CHECKPOINTS / "iteration_000004.pt")["ppo"]["model"], first["model"])
 
 
 def test_each_rank_resumes_its_own_worlds(cfg):

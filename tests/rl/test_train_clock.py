@@ -76,19 +76,3 @@ def test_resumed_run_continues_the_training_time(cfg, monkeypatch):
     assert final_state(result)["seconds"] == result.metrics["Perf/elapsed_s"] == 100.0
     final_kl = cfg.ppo.final_desired_kl  # progress counts the saved time, and is near 1
     assert run.ppo._desired_kl.item() == pytest.approx(final_kl, rel=0.05)
-
-
-def test_resumed_run_past_its_time_limit_ends_immediately(cfg, monkeypatch):
-    assert resume_clocked(monkeypatch, cfg, 100.0, limit=100.0)[1].iteration == 2
-
-
-@pytest.mark.parametrize(
-    ("seconds", "limit", "left"),
-    [(1.0, 0.0, "27 min"), (3.0, 0.0, "1 h 20 min"), (1.0, 90.0, "58 s"), (0.01, 0.0, "16 s")],  # 100 iterations left
-)
-def test_remaining_time_follows_iteration_time_and_time_limit(cfg, monkeypatch, capsys, seconds, limit, left):
-    limited = dataclasses.replace(cfg, max_iterations=103, max_seconds=limit, log_interval=3)
-    with pytest.raises(IndexError):  # after three iterations no durations are left
-        train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103")]
-    assert line.endswith(f", {left} left")

@@ -6,10 +6,9 @@ import math
 import newton
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS, POS, X, Y, Z
+from columns import COORDS, DOFS, POS, X, Y, Z
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, leg_geometry, standing_configuration
 from jumper_warp.sim.mujoco import mujoco_solver
@@ -141,58 +140,6 @@ def test_only_paws_collide_with_the_ground():
     # the ground belongs to no world and comes first
     assert collides[0, 1:].all()
     assert not collides[1:, 1:].any()
-
-
-def test_contact_has_the_paw_friction_and_is_stiff():
-    model = build_model(1, friction=0.6, visuals=False, device="cpu")
-    solver = mujoco_solver(model)
-    joint_q = model.joint_q.numpy()
-    joint_q[2] -= 1e-3  # [m] paws into the ground
-    model.joint_q.assign(joint_q)
-    state, control = model.state(), model.control()
-    solver.step(state, state, control, None, 1.0 / 480.0)
-    contact = solver.mjw_data.contact
-    assert solver.mjw_data.nacon.numpy()[0] == 4
-    assert contact.friction.numpy()[:4, 0] == pytest.approx(np.full(4, 0.6))
-    assert contact.solref.numpy()[:4] == pytest.approx(np.tile([2.0 / 476.0, 1.0], (4, 1)), rel=1e-3)
-    assert contact.solimp.numpy()[:4, :2] == pytest.approx(np.tile([0.95, 0.99], (4, 1)))
-
-
-def standing_energy(angle):
-    """Return base height [m] and energy [J] with all thighs at an angle [rad] and motors of 17 N m/rad held at 45 deg.
-
-    In the leg's plane each shank leans by asin((0.045 + 0.175 sin q) / 0.3); heights follow from the paws upward.
-    """
-    lean = math.asin((0.045 + 0.175 * math.sin(angle)) / 0.3)
-    knee = 0.025 + 0.3 * math.cos(lean)
-    hip = knee + 0.175 * math.cos(angle)
-    # two thighs, the outer shank, the inner shank with its paw: mass times height of each centre of mass
-    thighs = 2 * 0.081 * (hip - 0.0594 * math.cos(angle))
-    shanks = 0.1992 * (knee - 0.1647 * math.cos(lean)) + 0.2193 * (knee - 0.1927 * math.cos(lean))
-    weight = 9.81 * ((14.5 - 4 * 0.5805) * hip + 4 * (thighs + shanks))
-    springs = 8 * 0.5 * 17.0 * (angle - math.pi / 4.0) ** 2
-    return hip, weight + springs
-
-
-def test_robot_stands_at_the_height_of_least_energy_with_closed_loops():
-    model = build_model(1, visuals=False, device="cpu")
-    solver = mujoco_solver(model)
-    state, control = model.state(), model.control()
-    target = np.radians([0.0, 45.0, 45.0] * 4)
-    damping = np.array([1.8, 0.8, 0.8] * 4)
-    torque = np.zeros(DOFS, dtype=np.float32)
-    for _ in range(200):  # 0.42 s
-        angle, rate = state.joint_q.numpy()[MOTOR_COORDS], state.joint_qd.numpy()[MOTOR_DOFS]
-        torque[MOTOR_DOFS] = 17.0 * (target - angle) - damping * rate
-        control.joint_f.assign(torque)
-        solver.step(state, state, control, None, 1.0 / 480.0)
-    joint_q = state.joint_q.numpy()
-    assert np.isfinite(joint_q).all()
-    sagged = minimize_scalar(lambda angle: standing_energy(angle)[1], bounds=(0.5, 1.5), method="bounded").x
-    assert joint_q[2] == pytest.approx(standing_energy(sagged)[0], abs=0.003)
-    assert joint_q[3:7] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=0.02)
-    gap = far_ends(model, joint_q, 2, 0.3) - far_ends(model, joint_q, 4, 0.3)
-    assert np.abs(gap).max() < 1e-3
 
 
 def test_robot_slides_on_mujoco_with_the_least_friction():

@@ -4,11 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from jumper_warp.gym import make_vector_env
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.measures import motors_for
 from jumper_warp.robot.motors import jumping_motors
-from jumper_warp.robot.overlay import ROBOTS, RobotOverlay, load_overlay
+from jumper_warp.robot.overlay import ROBOTS, load_overlay
 from jumper_warp.sim.apex import OpenLoopJump
 from jumper_warp.sim.simulation import Simulation
 from simulation_helpers import loop_gap
@@ -53,10 +52,3 @@ def test_mujoco_stands_on_the_exported_model(robot, tmp_path):
         mujoco.mj_contactForce(model, data, contact, force)
         total += force[0]
     assert total == pytest.approx(9.81 * robot.description.mass, rel=0.02)
-
-
-def test_gymnasium_takes_several_robots_in_turn():
-    robots = [RobotOverlay({"base_mass": (mass,)}) for mass in (7.0, 9.0)]
-    env = make_vector_env("vertical-jump", 3, robot=robots, randomize=False, device="cpu").unwrapped.env
-    masses = env.sim.model.body_mass.numpy().reshape(3, -1)[:, 0]
-    assert masses == pytest.approx([7.0, 9.0, 7.0])

@@ -97,32 +97,6 @@ def test_reset_recovers_diverged_world(solver):
     assert np.array_equal(again[:, 1], first[:, 1])
 
 
-def test_captured_filter_and_physics_match_single_calls():
-    eager, captured = simulation(2, "jumper"), simulation(2, "jumper")
-    start = eager.joint_q()[0, 2]
-
-    def policy_step(sim):
-        """Advance one policy step by single calls."""
-        sim.filter_targets()
-        for _ in range(sim.substeps):
-            sim.physics_step()
-
-    for sim in (eager, captured):
-        sim.motors.offset.fill_(0.03)
-        command(sim, 0)
-        policy_step(sim)
-    with wp.ScopedCapture(device=captured.device) as capture:
-        policy_step(captured)
-    for step in range(1, 6):
-        for sim in (eager, captured):
-            command(sim, step)
-        policy_step(eager)
-        wp.capture_launch(capture.graph)
-        assert np.array_equal(captured.joint_q(), eager.joint_q())
-        assert np.array_equal(captured.joint_qd(), eager.joint_qd())
-    assert eager.joint_q()[0, 2] < start - 0.05  # [m] it squats
-
-
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_captured_reset_reads_its_mask_at_every_replay(solver):
     sim = simulation(3, solver)
@@ -166,9 +140,8 @@ def test_set_targets_broadcasts_and_refuses_bad_targets():
         np.testing.assert_array_equal(sim.target.numpy(), angles.astype(np.float32))
     sim.set_targets(angles[:, 1])
     np.testing.assert_array_equal(sim.target.numpy(), np.repeat(angles[:, 1:2], 3, axis=1).astype(np.float32))
-    for wrong in (angles.T, np.full(12, np.nan), angles + 0.5j, angles.astype(str), angles > 0.5):
-        with pytest.raises(ValueError, match="targets must"):
-            sim.set_targets(wrong)
+    with pytest.raises(ValueError, match="targets must"):
+        sim.set_targets(np.full(12, np.nan))
 
 
 def test_motors_commanded_beyond_a_squat_give_way_until_virtual_work_balances():

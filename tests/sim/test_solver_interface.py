@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 import warp as wp
 from newton import ModelFlags, StateFlags
-from newton.solvers import SolverBase
 
 from columns import COORDS, DOFS, MOTOR_DOFS, X, Z
-from jumper_warp.utils.errors import InputError
 from simulation_helpers import loop_gap, simulation
 from solver_helpers import BODIES, KNEE_V
 
@@ -162,14 +160,6 @@ def test_explicit_torques_match_closed_loop_motors():
     assert largest > 10.0
 
 
-def test_refuses_a_state_with_gradients():
-    sim = simulation(1)
-    out = sim.model.state()
-    out.joint_q.requires_grad = True
-    with pytest.raises(InputError, match=r"no gradients on Warp's tape; use jumper_warp\.diff\.rollout"):
-        sim.solver.step(sim.state, out, None, None, DT)
-
-
 def test_step_does_not_write_its_input():
     sim = simulation(2)
     launch(sim)
@@ -193,13 +183,3 @@ def test_bodies_match_newton_kinematics(pair):
     assert found == pytest.approx(expected, abs=2e-6)
     assert sim.state.body_qd.numpy() == pytest.approx(state.body_qd.numpy(), abs=1e-4)
     assert loop_gap(sim).max() < 1e-6
-
-
-def test_body_accelerations_are_observable_and_joint_forces_are_not():
-    sim = simulation(1, ground=None)
-    observables = sim.solver.observables({SolverBase.ObservableKind.BODY_QDD})
-    sim.solver.step(sim.state, sim.state, None, None, DT, observables=observables)
-    fall = np.tile([0.0, 0.0, -9.81, 0.0, 0.0, 0.0], (BODIES, 1))
-    assert observables.body_qdd.numpy() == pytest.approx(fall, abs=5e-3)
-    with pytest.raises(ValueError, match="body_parent_f"):
-        sim.solver.observables({"body_parent_f"})

@@ -2,9 +2,7 @@
 
 import copy
 import json
-import multiprocessing
 import pickle
-from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
@@ -29,10 +27,3 @@ def test_copy_equals_the_task(make, how):
     assert same is not task and same == task and hash(same) == hash(task)
     assert content(same) == content(task)
     assert same.params.names == task.params.names and same.params.values == task.params.values
-
-
-def test_task_reaches_a_spawned_process():
-    task = make_task("velocity-flat")
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        assert process.submit(copy.copy, task).result() == task
-        assert process.submit(content, task).result() == content(task)

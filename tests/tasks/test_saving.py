@@ -91,9 +91,3 @@ def test_changed_json_that_is_no_task_is_refused(change, message):
     change(content)
     with pytest.raises(TaskError, match=message):
         task_from_json(content)
-
-
-def test_missing_setting_has_its_default():
-    content = saved(make_task("vertical-jump"))
-    del content["contact_force"], content["curriculum"]["promote_after"], content["reset"]["settings"]["tilt"]
-    assert task_from_json(content) == make_task("vertical-jump")

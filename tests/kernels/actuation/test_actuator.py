@@ -5,8 +5,6 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given
-from hypothesis import strategies as st
 from newton.actuators import ClampingDCMotor, DrivePD
 
 from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS
@@ -66,17 +64,6 @@ def test_torque_by_hand(curve):
     for vel, torque in points:
         assert actuator.motor_torque(1.0, 0.0, vel, motor) == pytest.approx(torque, abs=2e-4)
         assert actuator.motor_torque(-1.0, 0.0, -vel, motor) == pytest.approx(-torque, abs=2e-4)
-
-
-finite = st.floats(-60.0, 60.0, width=32)  # [rad] or [rad/s], beyond all speeds of the torque curve
-
-
-@given(target=finite, pos=finite, vel=finite)
-def test_torque_is_within_saturation_and_odd(target, pos, vel):
-    motor = transversal_motor(kp=17.0, kd=0.8)
-    torque = actuator.motor_torque(target, pos, vel, motor)
-    assert abs(torque) <= 18.0 + 1e-5
-    assert actuator.motor_torque(-target, -pos, -vel, motor) == pytest.approx(-torque, abs=1e-5)
 
 
 def test_torque_equals_newtons_drive_and_dc_motor_below_the_overspeed_fade():

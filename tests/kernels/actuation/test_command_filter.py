@@ -4,8 +4,6 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given
-from hypothesis import strategies as st
 
 from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS
 from jumper_warp.kernels.actuation import command_filter
@@ -103,47 +101,6 @@ def test_infinite_command_becomes_finite(command, params, pos):
     assert np.all(np.abs(safe_leg((command,) * 3, pos, (0.0, 0.0, 0.0), params)) <= 720.1)  # [deg], two turns
 
 
-ROUNDING = 1.0e-4
-"""[deg] Nearer to a limit, degrees and single precision radians may be on different sides of it."""
-angle = st.floats(-300.0, 300.0, width=32)  # [deg]
-speed = st.floats(-2000.0, 2000.0, width=32)  # [deg/s]
-
-
-@given(raw=st.tuples(angle, angle), pos=st.tuples(angle, angle), vel=st.tuples(speed, speed))
-def test_sum_limit_corrects_both_transversal_commands_equally_and_binds_outside(raw, pos, vel):
-    wide = LimitsCfg(-1.0e3, 1.0e3)  # [deg], never reached
-    only_sum = filter_params(FilterCfg(wide, wide, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=0.1))
-    _, outer, inner = safe_leg((0.0, *raw), (0.0, *pos), (0.0, *vel), only_sum)
-    assert outer - raw[0] == pytest.approx(inner - raw[1], abs=1e-3)
-    if not -ROUNDING <= sum(pos) <= 240.0 + ROUNDING:
-        assert -1e-3 <= outer + inner <= 240.001
-
-
-@given(raw=angle, pos=st.floats(-200.0, 200.0, width=32), vel=speed)
-def test_lateral_command_is_clamped_outside_and_toward_a_limit_and_never_pushed_outward(raw, pos, vel):
-    """Lateral limits of JUMP are -15 and 15 deg; their hard zones reach from the limits to -5 and 0 deg."""
-    outside = not -15.0 - ROUNDING <= pos <= 15.0 + ROUNDING
-    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)
-    safe, _, _ = safe_leg((raw, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0))
-    if outside or toward:
-        assert -15.001 <= safe <= 15.001
-    assert min(raw, -15.0) - 1e-3 <= safe <= max(raw, 15.0) + 1e-3
-
-
-@given(raw=st.tuples(angle, angle, angle), pos=st.floats(60.0, 80.0, width=32), vel=st.floats(-200.0, 200.0, width=32))
-def test_commands_far_from_the_limits_pass_unchanged(raw, pos, vel):
-    # margins of at least 60 deg at 200 deg/s or less, of the sum 80 deg at 400 deg/s: longer than the horizon, 5/60 s
-    assert safe_leg(raw, (0.0, pos, pos), (0.0, vel, vel), WALK) == pytest.approx(raw, abs=1e-3)  # [deg]
-
-
-@given(raw=st.tuples(angle, angle), pos=angle, vel=speed)
-def test_filter_is_monotonic_in_the_command(raw, pos, vel):
-    low, high = sorted(raw)
-    # WALK has no hard zones, which depend on the command's direction and are not monotonic
-    safe = [safe_leg((command, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0), WALK)[0] for command in (low, high)]
-    assert safe[0] <= safe[1] + 1e-3
-
-
 def launch(module, target, q, qd, params, offset=None, requires_grad=False):
     """Return the filtered targets [rad] (12, num_worlds) of the kernel of `module` (single or double precision).
 
@@ -200,22 +157,6 @@ def test_gradients_equal_central_differences(cfg):
         numeric = (sides[0] - sides[1]) / (2.0 * step)
         assert abs(numeric) > 0.1, f"{name}: nothing to compare"
         assert np.sum(varied.grad.numpy() * direction) == pytest.approx(numeric, rel=1e-5), name
-
-
-def test_gradient_of_the_blend_by_hand():
-    # the upper limit u = 140 deg, margin 60 deg, w = 1 - margin / (v T): d safe / d raw = 1 - w = 1/2 at half the
-    # horizon; d safe / d vel = -(raw - u) margin / (v^2 T) = -(60 deg) (60 deg) / (900^2 (8/60)) = -1/30 s
-    q, qd = np.zeros(COORDS), np.zeros(DOFS)
-    q[8], qd[7] = math.radians(80.0), math.radians(900.0)  # the outer motor of FL, motor 1
-    target = np.zeros((12, 1))
-    target[1] = math.radians(200.0)
-    inputs = [wp.array(x, dtype=wp.float64, device="cpu", requires_grad=True) for x in (target, q, qd)]
-    params = filter_params(vertical_jump_filter(), module=filter64)
-    with wp.Tape() as tape:
-        safe = launch(filter64, *inputs, params, requires_grad=True)
-    tape.backward(grads={safe: wp.array(np.eye(12)[:, 1:2], dtype=wp.float64, device="cpu")})
-    assert inputs[0].grad.numpy()[1, 0] == pytest.approx(0.5)
-    assert inputs[2].grad.numpy()[7] == pytest.approx(-1.0 / 30.0)
 
 
 @wp.kernel(enable_backward=False)

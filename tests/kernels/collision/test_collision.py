@@ -253,32 +253,6 @@ def test_clearance_is_equal_in_double_precision():
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
 STAND = (0, 45, 45) * 4  # [deg] lateral, outer, inner of FL, FR, BL, BR
-CASES = {  # base position [m], quaternion xyzw, motor angles [deg], expected flags
-    "standing": ((0, 0, 0.397), LEVEL, STAND, ()),
-    # shell bottom 0.049 below the base, legs stretched out sideways above it
-    "belly 1 mm in the ground": ((0, 0, 0.048), LEVEL, (90, 45, 45) * 4, ("BODY_GROUND",)),
-    # the housings end 0.001 above the shell's bottom
-    "on the belly and housings": ((0, 0, 0.047), LEVEL, (90, 45, 45) * 4, ("BODY_GROUND", "HOUSING_GROUND")),
-    # outer knees at 0.175 cos(30°) = 0.152 under the axes, shanks folded up and down around them
-    "knees down": ((0, 0, 0.165), LEVEL, (0, 30, 30) * 4, ("KNEE_GROUND", "SHANK_GROUND")),
-    # upside down the trunk's top, 0.099 above the base, comes first
-    "on the back": ((0, 0, 0.098), (1.0, 0.0, 0.0, 0.0), STAND, ("BODY_GROUND",)),
-    # knees 0.09 + 2 * 0.175 sin(-8°) = 0.041 apart: thighs clear by 0.003, upper shanks (0.5 * 0.041 < 0.024) not
-    "shanks of a leg": ((0, 0, 1), LEVEL, (0, -8, -8, 0, 45, 45, 0, 45, 45, 0, 45, 45), ("LEG_SELF",)),
-    # both front paws swing to the middle: hip 0.105 + 0.0602 cos(30°) - 0.4716 sin(30°) < 0
-    "front paws cross": ((0, 0, 1), LEVEL, (-30, 0, 0, -30, 0, 0, 0, 45, 45, 0, 45, 45), ("LEG_LEG",)),
-    # left legs reach for one another under the trunk, and 15° of lateral bring them into one plane
-    "left legs cross": ((0, 0, 1), LEVEL, (5, 0, 110, 0, 45, 45, -8, 0, 110, 0, 45, 45), ("LEG_LEG",)),
-    # laterals straight up turn raised thighs down into the trunk
-    "thigh into the trunk": ((0, 0, 1), LEVEL, (100, 60, 135, *STAND[3:]), ("LEG_SHELL",)),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_flags_by_hand(case):
-    pos, quat_xyzw, motors, expected = CASES[case]
-    flags, _ = collide(pos, quat_xyzw, motors)
-    assert {name for name, mask in zip(FLAGS, MASKS, strict=True) if flags[0] & mask} == set(expected)
 
 
 def workspace(count):

@@ -226,21 +226,6 @@ def test_only_worlds_with_a_new_episode_sample_new_ground():
     assert changed.nonzero()[0].tolist() == [3, 5]
 
 
-def test_fields_of_missing_blocks_stay_0_while_stepping():
-    env = sampled_ground_env(
-        "horizontal-jump", 256, GroundCfg(platform=0.2, block=0.2), levels=FAR, reset=only("default")
-    )
-    none = block_fields(env)["exists"] == 0
-    for _ in range(5):
-        env.step(torch.zeros((256, 12)))
-        assert not env.done.any()
-    after = block_fields(env)
-    assert none.any() and not none.all()
-    for name, values in after.items():
-        assert not values[none].any(), name
-    assert all(np.isfinite(values).all() for values in after.values())
-
-
 def hold(env, steps=20):
     """Command the present motor angles for `steps` policy steps; fail if an episode ends or a world diverges."""
     angles = env.sim.joint_q()[:, MOTOR_COORDS]

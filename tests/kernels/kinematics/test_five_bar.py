@@ -175,20 +175,6 @@ def test_ankle_of_symmetric_leg_by_hand(build, angle, depth):
         assert ankle == pytest.approx([0.5 * (geo["outer_x"] + geo["inner_x"]), -depth], abs=5.0e-5)
 
 
-def test_jacobian_of_symmetric_leg_by_hand(build):
-    # depth = 0.175 cos a + sqrt(0.09 - w^2), w = 0.045 + 0.175 sin a; at 45 degrees w = 0.168744, sqrt = 0.248046
-    fields = build(0, np.radians([[45.0, 45.0, 0.0, 0.0]]))
-    _, rise = fields["ankle_do"][0] + fields["ankle_di"][0]  # [m/rad] d (x, z) of the ankle / d a
-    assert rise == pytest.approx(0.123744 + 0.168744 * 0.123744 / 0.248046, abs=2.0e-6)
-
-
-def test_parallel_thighs_move_ankle_on_a_circle(build):
-    # outer = -inner keeps knees 0.09 m apart and level: the ankle moves as the thigh tips do, 0.175 m/rad
-    fields = build(0, np.array([[0.0, 0.0, 1.0, -1.0]]))  # at 0 rad, 1 and -1 rad/s
-    assert fields["ankle_do"][0] - fields["ankle_di"][0] == pytest.approx([0.175, 0.0], abs=1.0e-6)
-    assert fields["ankle_acc"][0] == pytest.approx([0.0, 0.175], abs=1.0e-6)
-
-
 def test_five_bar_with_coinciding_knees_is_finite(build):
     angle = -math.asin(0.045 / 0.175)  # both knees at the middle of the axes, which are 2 x 0.045 m apart
     fields = build(0, np.array([[angle, angle, 10.0, -10.0]]))

@@ -85,12 +85,6 @@ def build(request):
 
 
 @pytest.fixture(scope="module")
-def double():
-    """Return the `Build` of double precision."""
-    return Build("jumper_warp.kernels_float64")
-
-
-@pytest.fixture(scope="module")
 def robot():
     """Return Pinocchio's model of the robot, the oracle."""
     return build_pinocchio()
@@ -176,19 +170,6 @@ def test_every_pose_is_within_limits(build):
 
 
 # --- Velocity ---
-
-
-def test_motor_rates_move_the_ankles_by_the_given_velocity(build, double):
-    rng = np.random.default_rng(8)
-    motors = np.radians(rng.uniform(-5.0, 110.0, (12, 500)))
-    motors[1::3] = np.abs(motors[1::3])
-    motors[2::3] = np.abs(motors[2::3])
-    wanted = rng.uniform(-1.0, 1.0, (4, 500, 3))
-    rates = build.legs_at(motors, wanted).rates.astype(float).transpose(0, 2, 1).reshape(12, 500)
-    dt = 1.0e-6 / np.maximum(np.abs(rates).max(axis=0), 1.0)  # [s]
-    ahead, behind = (double.legs_at(motors + sign * dt * rates).ankle for sign in (1.0, -1.0))
-    reached = (ahead - behind) / (2.0 * dt[:, None])
-    np.testing.assert_allclose(reached, wanted, atol=1.0e-7 if build.double else 2.0e-5)  # [m/s]
 
 
 def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):

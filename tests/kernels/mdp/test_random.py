@@ -148,13 +148,6 @@ def test_neighbouring_worlds_and_columns_are_independent():
         assert np.abs(matrix).max() < 5.0 / math.sqrt(WORLDS)
 
 
-def test_uniform_numbers_fill_their_range():
-    _, uniform, _ = samples()
-    assert uniform.min() >= -2.0 and uniform.max() < 3.0
-    for column in range(COLUMNS):
-        assert kstest((uniform[:, column] + 2.0) / 5.0, "uniform").pvalue > 1e-3
-
-
 def test_clamped_normal_numbers_have_the_clamped_gaussians_moments_and_distribution():
     _, _, normal = samples()
     cells = normal.size
