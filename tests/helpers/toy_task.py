@@ -148,8 +148,6 @@ def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
     torch.distributed.destroy_process_group()
 
 
-
-
 def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
     """Train in one of two processes, then again from the middle; episodes are longer than an iteration."""
 
