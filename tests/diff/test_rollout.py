@@ -1,5 +1,7 @@
 """Rollouts: forward pass against the simulation, threads, the PyTorch bridge, and refusals of bad input."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -189,6 +191,23 @@ def test_reverse_pass_refuses_changed_outputs_and_parameters():
         made = simulate(of, targets, q, qd)
 
 
+@pytest.mark.parametrize("seconds", [-0.05, -0.001, float("-inf"), float("nan")])
+def test_negative_latency_counts_as_zero(seconds, monkeypatch):
+    """Checks of the latency are off, as on a GPU; equal worlds stay equal with any latency."""
+    monkeypatch.setattr("jumper_warp.diff.rollout.check_within", lambda *_: None)
+    of, targets, ends = Rollout(build_model(4, visuals=False)), np.full((3, 12), 0.4), []
+    for latency in (0.0, seconds):
+        of.parameters["latency"].fill_(latency)
+        trajectory = of.run(targets, *of.standing())
+        gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
+        ends.append((trajectory.q.numpy()[-1], gradients["targets"].numpy()))
+    if math.isfinite(seconds):
+        np.testing.assert_array_equal(ends[1][0], ends[0][0])
+        np.testing.assert_array_equal(ends[1][1], ends[0][1])
+    for values in ends[1]:
+        np.testing.assert_array_equal(values, np.repeat(values[..., :1], 4, axis=-1))
+
+
 @pytest.fixture
 def blocks_of_threads():
     """Enable blocks of several threads on the CPU."""
@@ -220,3 +239,14 @@ def test_thread_per_leg_matches_thread_per_world(every):
     for name, values in results[1].items():
         scale = np.abs(values).max()
         np.testing.assert_allclose(results[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
+
+
+def test_first_run_on_two_threads_matches_one():
+    """The kernel's module is unloaded before each run: no thread may launch before it is loaded."""
+    model, targets = build_model(64, visuals=False), np.full((4, 12), 0.8)
+    heights = []
+    for threads in (1, 2):
+        of = Rollout(model, double=True, threads=threads)
+        of.dynamics.modules.rollout.rollout_kernel.module.unload()
+        heights.append(of.run(targets, *of.standing()).q.numpy()[-1, 2])
+    assert np.array_equal(*heights)

@@ -48,20 +48,6 @@ def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
 
 
-def test_resumed_run_drops_partial_lines_and_later_iterations(cfg, capsys):
-    half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
-    path = half.folder / METRICS_FILE
-    kept = path.read_text().splitlines()[:2]
-    path.write_bytes(path.read_bytes()[:-30])
-    resume = str(half.folder / CHECKPOINTS / "iteration_000002.pt")
-    capsys.readouterr()
-    train(dataclasses.replace(cfg, resume=resume), PushTask)
-    assert iterations(path) == [1, 2, 3, 4, 5, 6]
-    assert path.read_text().splitlines()[:2] == kept
-    stderr = [line for line in capsys.readouterr().err.splitlines() if str(path) in line]
-    assert stderr == [f"{path}: removed 2 incomplete or later lines"]
-
-
 @pytest.mark.parametrize(
     ("content", "kept"),
     [

@@ -274,6 +274,21 @@ def test_blocks_are_placed_and_reset_by_indices_mask_and_solver_reset():
     assert np.array_equal(sim.solver.block_position(), starts)
 
 
+def test_block_of_a_diverged_world_returns_to_its_start():
+    sim = on_block(2, settle=2, mass=5.0, friction=0.0)
+    set_block_velocity(sim, [[1.0, 0.0], [1.0, 0.0]])
+    sim.step()
+    assert sim.solver.block_position()[:, X].min() > 1e-3
+    rates = sim.joint_qd().copy()
+    rates[0, 7] = np.nan  # FL_outer of world 0
+    sim.state.joint_qd.assign(rates.ravel())
+    sim.step()
+    sim.step()
+    assert sim.solver.diverged.numpy().tolist() == [1, 0]
+    assert np.array_equal(sim.solver.block_position()[0], [0.0, 0.0])
+    assert np.isfinite(sim.solver.block_velocity()).all()
+
+
 def test_refuses_blocks_on_mujoco():
     with pytest.raises(ValueError, match="needs solver='jumper'"):
         simulation(1, solver="mujoco", block=BlockCfg(center=(1.0, 0.0)))

@@ -170,6 +170,14 @@ def test_gradients_equal_central_differences():
         assert np.sum(varied.grad.numpy() * direction) == pytest.approx(numeric, rel=1e-6), name
 
 
+def test_saturation_is_clamped_to_peak_torque():
+    # peak: 18 N m lateral, 24.8 N m transversal
+    full = jumping_motors(24.8)
+    assert (full.lateral.saturation, full.transversal.saturation) == (18.0, 24.8)
+    task = jumping_motors(18.0, lateral_torque=10.0)
+    assert (task.lateral.saturation, task.transversal.saturation) == (10.0, 18.0)
+
+
 def test_arrays_repeat_lateral_and_transversal_constants():
     motors = motor_arrays(walking_motors(), 2, device="cpu")  # rows lateral, outer, inner of each leg; 2 worlds
     np.testing.assert_allclose(motors.kd.numpy(), np.tile([[2.07], [0.92], [0.92]], (4, 2)), rtol=1e-6)
