@@ -106,7 +106,7 @@ def test_loop_coordinates_are_relative_rotations_of_shanks(model):
     ("joint", "link", "length", "axis", "side", "least"),
     [(0, 4, 0.3, Y, SIDE, 0.03), (1, 1, 0.175, X, FRONT, 0.01), (3, 3, 0.175, X, -FRONT, 0.01),
      (2, 2, 0.3, X, -FRONT, 0.01), (4, 4, 0.3, X, FRONT, 0.01)],
-    ids=["lateral: outward", "outer: from its twin", "inner: from its twin", "knees: toward each other", "inner knee"],
+    ids=["lateral", "outer thigh", "inner thigh", "outer knee", "inner knee"],
 )  # fmt: skip
 def test_positive_angle_moves_the_end_of_a_link(model, joint, link, length, axis, side, least):
     joint_q = model.joint_q.numpy()[:COORDS].astype(float)
