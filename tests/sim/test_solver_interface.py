@@ -7,6 +7,7 @@ import warp as wp
 from newton import ModelFlags, StateFlags
 
 from columns import COORDS, DOFS, MOTOR_DOFS, X, Z
+from jumper_warp.utils.errors import InputError
 from simulation_helpers import loop_gap, simulation
 from solver_helpers import BODIES, KNEE_V
 
@@ -158,6 +159,14 @@ def test_explicit_torques_match_closed_loop_motors():
         assert explicit.joint_q() == pytest.approx(driven.joint_q(), abs=1e-5)
         largest = max(largest, np.abs(joint_f).max())
     assert largest > 10.0
+
+
+def test_refuses_a_state_with_gradients():
+    sim = simulation(1)
+    out = sim.model.state()
+    out.joint_q.requires_grad = True
+    with pytest.raises(InputError, match=r"no gradients on Warp's tape; use jumper_warp\.diff\.rollout"):
+        sim.solver.step(sim.state, out, None, None, DT)
 
 
 def test_step_does_not_write_its_input():

@@ -5,8 +5,10 @@ import pytest
 
 from hold_height import hold_height
 from jumper_warp.envs.skill import TaskRuntime
+from jumper_warp.kernels.jump import rewards
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.errors import InputError
 
 STEP_DT = 1.0 / 60.0
@@ -38,6 +40,16 @@ def test_a_parameter_has_the_same_bounds_in_a_term_and_while_an_environment_runs
     term = next(slot.term for slot in task.params.slots[section] if slot.term.name == name)
     with pytest.raises(InputError, match=message):
         term.with_flat_numbers((term.flat_numbers | {key: value}).values())
+
+
+@pytest.mark.parametrize(
+    ("func", "name", "numbers"),
+    [(rewards.soft_impact, "limit", {}), (rewards.landing_tilt, "angle", {}),
+     (rewards.squat, "acceleration", {"std": 0.03, "takeoff_height": 0.3, "floor": 0.15})],
+)  # fmt: skip
+def test_refuses_to_divide_by_zero(func, name, numbers):
+    with pytest.raises(InputError, match=f"'{name}' must be a width"):
+        RewardTerm(func, 1.0, **numbers, **{name: 0.0})
 
 
 def test_randomisation_at_the_ends_of_the_bounds_is_accepted():
