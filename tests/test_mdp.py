@@ -26,8 +26,3 @@ def test_flight_begins_with_a_rise_without_contact_and_ends_with_contact(contact
     robot.contacts = contacts
     robot.lin_vel = wp.vec3(0.0, 0.0, speed)
     assert tuple(mdp.in_flight(robot, flying, 0.75) for flying in (False, True)) == flies
-
-
-def test_namespaces_hold_stock_functions():
-    for term in (mdp.rewards.action_rate, mdp.terminations.tilted, mdp.observations.angle, mdp.events.base_mass):
-        assert isinstance(term, wp.Function)

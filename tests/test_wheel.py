@@ -30,18 +30,11 @@ for name in policy_tasks():
 """
 
 
-def python(*args, folder, paths=()):
-    """Run Python in a folder with `paths` as PYTHONPATH; return its exit code, lines of stdout, and stderr."""
+def python(code, folder, *paths):
+    """Run Python code in a folder with `paths` as PYTHONPATH; return its lines of stdout, or of stderr if it fails."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
-    done = subprocess.run([sys.executable, *args], cwd=folder, env=environment, capture_output=True, text=True)
-    return done.returncode, done.stdout.splitlines(), done.stderr
-
-
-def run(code, folder, *paths):
-    """Run Python code in a folder, with `paths` as PYTHONPATH, and return its output lines; fail on an error."""
-    returncode, printed, errors = python("-c", code, folder=folder, paths=paths)
-    assert returncode == 0, errors
-    return printed
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    return (done.stderr if done.returncode else done.stdout).splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +44,7 @@ def wheel(tmp_path_factory):
     for name in SOURCES:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tree / name, **({"symlinks": True} if copy is shutil.copytree else {}))
-    return tree / run(BUILD, tree)[-1]
+    return tree / python(BUILD, tree)[-1]
 
 
 def test_wheel_holds_one_package_and_all_assets(wheel):
@@ -70,12 +63,11 @@ def test_installed_package_finds_assets_and_policies_from_another_folder(wheel, 
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     zipfile.ZipFile(wheel).extractall(site)
     elsewhere.mkdir()
-    package, *listed = run(USE_PACKAGE, elsewhere, site)  # its path, and the JSON of `jumper list`
+    package, *listed = python(USE_PACKAGE, elsewhere, site)  # its path, and the JSON of `jumper list`
     assert Path(package).is_relative_to(site)
     assert [policy["name"] for policy in json.loads("\n".join(listed))["policies"]] == list(policy_tasks())
 
 
 def test_kernels_folder_of_the_source_tree_refuses_import():
-    returncode, _, errors = python("-c", "import kernels", folder=ROOT)
-    assert returncode == 1
-    assert errors.splitlines()[-1].startswith("ImportError: import jumper_warp.kernels: the folder kernels/ is not")
+    error = python("import kernels", ROOT)[-1]
+    assert error.startswith("ImportError: import jumper_warp.kernels: the folder kernels/ is not")

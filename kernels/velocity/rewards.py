@@ -33,6 +33,24 @@ def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
 
 
 @wp.func
+def yaw_rate_on_course(robot: RobotView, state: VelocityState, std: float, std_lin_vel: float) -> float:
+    """Reward for tracking the commanded yaw rate by robots that also track the commanded velocity.
+
+    It is phi_std of the error of the yaw rate [rad/s] times phi_std_lin_vel of the horizontal velocity error [m/s].
+    Without the second factor, a robot that stands still keeps its yaw rate best, and may never begin to walk.
+    """
+    error = velocity_error(robot, state)
+    return phi(error[2], std) * phi(wp.length(wp.vec2(error[0], error[1])), std_lin_vel)
+
+
+@wp.func
+def lin_vel_xy_l1(robot: RobotView, state: VelocityState) -> float:
+    """Penalty of the horizontal velocity error: its length [m/s], body axes. Its slope is the same at any error."""
+    error = velocity_error(robot, state)
+    return wp.length(wp.vec2(error[0], error[1]))
+
+
+@wp.func
 def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
     """Penalty of vertical motion of the base: its squared velocity along body z [m^2/s^2]."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]

@@ -2,14 +2,9 @@
 
 import dataclasses
 import math
-from functools import partial
 
-import numpy as np
 import pytest
 
-from jumper_warp.evaluation.attitude import AttitudeLog
-from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.velocities import VelocityLog
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PPO_BOUNDS, PpoCfg, TrainCfg
@@ -17,12 +12,9 @@ from jumper_warp.robot.motors import MOTOR_BOUNDS, FilterCfg, LimitsCfg, jumping
 from jumper_warp.robot.overlay import RANDOMIZED, RANGES, RobotOverlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg
 from jumper_warp.tasks.cfg import TASK_BOUNDS
-from jumper_warp.tasks.jump.cfg import GroundCfg, Level, ResetCfg, StartProbability
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import OBSERVATION_BOUNDS
-from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
 from jumper_warp.utils.errors import InputError
 
 IMPOSSIBLE = (math.nan, math.inf, -math.inf, 1e30, -1e30)
@@ -60,29 +52,6 @@ def test_impossible_number_is_refused_in_one_line(setting):
             SETTINGS[setting](value)
         message = str(refusal.value)
         assert "\n" not in message and any(word in message for word in (setting.split()[-1], "limit", "zones"))
-
-
-@pytest.mark.parametrize(
-    "cfg",
-    [GroundCfg(), ResetCfg(), StartProbability(default=1.0), CommandCfg(), VelocityResetCfg(), AttitudeResetCfg(),
-     Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.7), (0.2, 0.3))],
-    ids=lambda cfg: type(cfg).__name__,
-)  # fmt: skip
-def test_field_of_another_type_is_refused_by_name(cfg):
-    for name in vars(cfg):
-        for value in ("5", ("5", "5"), b"5", [1.0]):
-            with pytest.raises(InputError, match=f" {name} must be "):
-                dataclasses.replace(cfg, **{name: value})
-
-
-@pytest.mark.parametrize(
-    "log",
-    [AttitudeLog, partial(JumpLog, terminations=("success",)), partial(VelocityLog, np.zeros((1, 1, 3)), None, 1.0)],
-)
-def test_evaluation_refuses_other_than_numbers(log):
-    for values in (np.full(1, 0.5j), np.array(["0.5"])):
-        with pytest.raises(InputError, match="must be an array of numbers"):
-            log(values)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,3 @@
-import dataclasses
-import os
 import shutil
 import subprocess
 import sys
@@ -15,12 +13,9 @@ from jumper_warp.cli import main as cli
 from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import parse_settings, parse_train
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.commands import PlayCfg
-from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags, LandingPlayFlags
 from jumper_warp.policies.policy import Policy, load_policy, save_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from jumper_warp.viz.rerun_server import viewer_command
 from landing_helpers import still_policy
@@ -50,30 +45,22 @@ def still(tmp_path_factory):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (
-            ["fly"],
-            "no command 'fly'; there are train, watch, finetune, play, drive, evaluate, compare, try, sweep, "
-            "rescore, export, deploy, bus-sim, sysid, robot, list",
-        ),
+        (["fly"], "no command 'fly'; there are train, watch, finetune, play"),
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),
-        (["train", "--max-iterations", "3"], "the task comes first"),
-        ([*TRAIN, "--task", "other"], "give the task once"),
+        (["train", "vertical-jump", "--resume", "latest", "--init-policy", "vertical_jump"], "not both"),
         ([*TRAIN, "--env.rewards.jump-height.weight", "nan"], "jump-height.weight must be a finite number"),
-        (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
-        (["list", "--task-module", "missing.py"], "missing.py: no such file (tasks of your own)"),
-        (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
+        (["list", "--task-module", "missing.py"], "missing.py: no such file (tasks of your own)"),
         (["play", "missing"], "no policy 'missing'"),
         (["evaluate", "velocity_flat"], "a task, not a policy; its policies: walking_flat"),
-        (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
-        (["finetune", "vertical_jump", "--out", "."], "a policy's folder needs a name, got ."),
-        (["evaluate", "walking_flat", "--seconds", "0.001"], "seconds must be in [0.02, 600], got 0.001"),
-        (["train", "vertical-jump", "--init-policy="], "empty value of --init-policy"),
-        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "empty value after --log-root"),
+        (["evaluate", "vertical_jump", "--height-range", "1.0", "0.5"], "height_range must be"),
         (["evaluate", "vertical_jump", "--out", "\udcff"], "'\\udcff' is not UTF-8"),
-        (["play", "walking_flat", "--command-interval", "0.001"], "seconds must be in [0.02, 600], got 0.006"),
-        (["evaluate", "horizontal_jump", "--suite", "grid", "--rows", "9999"], "columns, rows and num_jumps must be"),
+        (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
+        (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "empty value after --log-root"),
+        (["sysid", "x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
+        (["sysid", "x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg)"),
+        (["sysid", "x.npz", "--noise.angle", "0"], "noise angle must be in 1e-06 to 90 deg"),
     ],
 )
 def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkeypatch, args, message):
@@ -81,15 +68,6 @@ def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkey
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0] and not list(tmp_path.iterdir())
-
-
-def test_a_deleted_working_directory_is_named(capsys, tmp_path, monkeypatch):
-    (tmp_path / "deleted").mkdir()
-    monkeypatch.chdir(tmp_path / "deleted")
-    (tmp_path / "deleted").rmdir()
-    with pytest.raises(SystemExit):
-        cli.run_command(os.getcwd)
-    assert capsys.readouterr().err == "jumper: working directory: No such file or directory\n"
 
 
 def test_flag_of_a_duration_may_be_infinite_for_never(capsys):
@@ -128,61 +106,23 @@ def parsed(task, args):
     return parse_settings(Recipe(task), args)[1]
 
 
-def leaves(value, path=""):
-    """Yield the expected flag and the value of each setting in nested dataclasses; path: dotted, of `value`."""
-    if dataclasses.is_dataclass(value):
-        for spec in dataclasses.fields(value):
-            yield from leaves(getattr(value, spec.name), f"{path}.{flag_name(spec.name)}")
-    elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-        for i, each in enumerate(value):
-            yield from leaves(each, f"{path}.{i}")
-    else:
-        yield f"--env{path}", value
-
-
-@pytest.mark.parametrize("name", ["horizontal-jump", "hold-height"])
-def test_flag_exists_for_each_setting_outside_terms(name):
-    task = hold_height() if name == "hold-height" else make_task(name)
-    parts = {
-        "reset": task.reset.settings, "levels": task.levels, "motors": task.motors, "randomization": task.randomization,
-        "command-filter": task.command_filter, "action-scale": task.action_scale, "contact-force": task.contact_force,
-        "reward-floor": task.reward_floor,
-    }  # fmt: skip
-    settings = dict(leaf for part, value in parts.items() for leaf in leaves(value, f".{part}"))
-    args = []
-    for flag, value in settings.items():
-        if isinstance(value, bool):
-            args.append(flag if value else f"{flag[: flag.rindex('.') + 1]}no-{flag[flag.rindex('.') + 1 :]}")
-        else:
-            args += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
-    assert parsed(task, args) == task and len(settings) > 40
-
-
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])
 def test_default_flags_do_not_change_the_task(name):
     task = hold_height() if name == "hold-height" else make_task(name)
     assert with_flags(task, flags_of(task)) == task == parsed(task, [])
 
 
-def test_flags_set_training_and_task_settings():
+def test_flags_set_training_and_task_settings_outside_terms():
     flags = (
-        "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.std-fine 0.2"
-        " --env.terminations.wrong-height.tolerance 0.07 --env.advance.takeoff-speed 0.5"
-        " --env.observations.actor.lin-vel.noise 0.3 --env.observations.actor.gravity.history 2"
-        " --env.curriculum.tolerance 0.05 --env.curriculum.promote-after 7"
-        " --env.reset.start-probability.standing 0.45 --env.reset.start-probability.default 0.2"
-        " --env.reset.ground.drop 0.1 0.2 --env.levels.1.next-jump-probability 0.5 --env.motors.lateral.kp 11"
-        " --env.command-filter.sum.upper 200 --env.randomization.latency None --env.action-scale 10 80"
-        " --env.contact-force 0.2 --env.reward-floor None --ppo.gamma 0.9 --no-noise --solver mujoco"
+        " --env.observations.actor.gravity.history 2 --env.reset.start-probability.standing 0.45"
+        " --env.reset.start-probability.default 0.2 --env.reset.ground.drop 0.1 0.2"
+        " --env.levels.1.next-jump-probability 0.5 --env.motors.lateral.kp 11 --env.command-filter.sum.upper 200"
+        " --env.randomization.latency None --env.action-scale 10 80 --env.contact-force 0.2 --env.reward-floor None"
+        " --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
     recipe, _ = parse_train(["Olympus-Vertical-Jump", *flags.split()])
     task = recipe.task
-    assert task.rewards[0].numbers == {"weight": 25.0, "std_fine": 0.2, "scale_sharp": 0.05, "std_wide": 0.4}
-    assert {end.name: end.numbers for end in task.terminations}["wrong_height"] == {"tolerance": 0.07}
-    seen = {term.name: term for term in task.observations.actor}
-    assert (seen["lin_vel"].numbers["noise"], seen["gravity"].options["history"]) == (0.3, 2)
-    assert task.advance.numbers == {"takeoff_speed": 0.5}
-    assert task.curriculum.numbers == {"tolerance": 0.05, "promote_after": 7}
+    assert {term.name: term for term in task.observations.actor}["gravity"].options["history"] == 2
     assert task.reset.settings.start_probability.standing == 0.45 and task.reset.settings.ground.drop == (0.1, 0.2)
     assert task.levels[1].next_jump_probability == 0.5 and task.levels[0] == make_task("vertical-jump").levels[0]
     assert task.motors.lateral.kp == 11.0 and task.command_filter.sum.upper == 200.0
@@ -215,24 +155,6 @@ def test_flags_set_device_arrays():
     settings = skill.settings_of_skill()
     assert settings.contact_force == pytest.approx(0.7)
     assert settings.action_scale[1] == pytest.approx(np.radians(80.0))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: HeightFlags(num_jumps=0), "num_jumps must be at least 1"),
-        (lambda: HeightFlags(height_range=(1.0, 0.5)), "height_range must be"),
-        (lambda: LandingFlags(goal_x=(1.0, 0.5)), "goal_x must be in"),
-        (lambda: LandingFlags(heading=float("inf")), "heading must be finite, got inf"),
-        (lambda: LandingFlags(success_range=(1.0, 0.5)), "success_range must be in"),
-        (lambda: HeightPlayFlags(height=(-1.0,)), "height takes 1 to 64"),
-        (lambda: LandingPlayFlags(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
-        (lambda: PlayCfg(HeightPlayFlags(), seconds=0.0), "seconds must be in"),
-    ],
-)
-def test_refuses_settings_out_of_range(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
 
 
 # ---------------------------------------------------------------------- from training to a recording
@@ -315,15 +237,6 @@ def test_play_horizontal_jumps_records_distances_and_goals_and_writes_film_and_p
         assert (animation.n_frames, animation.size, picture.size[0]) == (5, (96, 64), 1600)  # 0.23 s at half speed
 
 
-def test_play_walks_for_the_given_time(tmp_path, capsys):
-    args = ["--velocity", "0.5", "0", "0.3", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
-    code, out, _ = run(capsys, "play", "walking_flat", *args)
-    assert code == 0 and "walked" in out and "command yaw rate    0.3" in out
-    series = curves(tmp_path / "robot.rrd")
-    (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command" in name)
-    assert yaw_rate_command == pytest.approx([0.3] * 15)
-
-
 def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     script = tmp_path / "script.json"
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
@@ -338,29 +251,8 @@ def test_viewer_binds_to_loopback(tmp_path):
     assert command[command.index("--bind") + 1] == "127.0.0.1"
 
 
-def redirected(redirection, *args):
-    """Return the finished process of a command whose streams a shell has redirected."""
-    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", *args]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-@pytest.mark.parametrize(("args", "code"), [(["info", "vertical_jump"], 0), (["no"], 2)])
-def test_messages_that_cannot_be_written_do_not_change_result_and_exit_code(args, code, capsys):
-    done = redirected("2>/dev/full", *args)
-    assert (done.returncode, done.stdout) == (code, run(capsys, *args)[1])
-
-
-def test_closed_streams_exit_with_0():
-    done = redirected("<&- >&- 2>&-", "list")
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_help_ends_in_a_narrow_terminal(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "1")
-    assert run(capsys, "list", "--help")[0] == 0
-
-
-def test_info_works_in_a_deleted_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    tmp_path.rmdir()
-    assert run(capsys, "info", "vertical_jump")[0] == 0
+@pytest.mark.parametrize(("redirection", "word", "code"), [("2>/dev/full", "no", 2), ("<&- >&- 2>&-", "list", 0)])
+def test_messages_that_cannot_be_written_do_not_change_the_exit_code(redirection, word, code):
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "jumper_warp", word]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")

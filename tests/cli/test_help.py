@@ -15,11 +15,6 @@ def test_help_of_train_fits_60_lines(capsys, monkeypatch, task):
     assert all(f" --{name}" in out for name in SHORT_HELP)
 
 
-def test_help_of_a_group_of_a_task(capsys):
-    code, out, _ = run(capsys, "train", "vertical-jump", "--help", "env.rewards")
-    assert code == 0 and "--env.rewards.jump-height.weight" in out and "--env.reset" not in out and "--ppo" not in out
-
-
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
 def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, capsys):
     recipe, _ = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])

@@ -5,7 +5,6 @@ import json
 import pytest
 import torch
 
-from cli_helpers import run
 from jumper_warp.cli import main as cli
 from jumper_warp.policies.policy import Policy
 from jumper_warp.rl.checkpoint import load_checkpoint
@@ -49,17 +48,3 @@ def test_latest_or_new_resumes_the_run_that_it_started(tmp_path, capsys):
     config = json.loads((folder / "config.json").read_text())["train"]
     assert (config["max_iterations"], config["init_policy"]) == (2, "horizontal_jump")
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--init-policy", "vertical_jump"], "init_policy: observation "),
-        (["--init-policy", "horizontal_jump", "--ppo.symmetry", "off"], "pass --ppo.hidden 512 256 256"),
-        (["--init-policy", "horizontal_jump", "--resume", "latest"], "not both"),
-    ],
-)
-def test_refuses_unsuitable_initial_policies(more, message, capsys, tmp_path):
-    code, _, err = run(capsys, *TRAIN, *more, "--log-root", str(tmp_path))
-    assert code == 2 and message in " ".join(err)
-    assert not list(tmp_path.iterdir())

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from cli_helpers import run
-from jumper_warp.cli import main as cli
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.torch.ppo import Ppo
 
@@ -50,13 +49,3 @@ def test_training_resumes_after_it_ran_out_of_memory(capsys, monkeypatch, tmp_pa
     code, out, _ = run(capsys, *err[-1].partition(" with: jumper ")[2].split())
     assert (code, out.strip()) == (0, str(folder))
     assert (folder / "checkpoints" / "iteration_000003.pt").exists()
-
-
-def test_another_command_reports_exhausted_memory_in_one_line(capsys):
-    def command():
-        raise type(ERRORS[1])(*ERRORS[1].args)
-
-    with pytest.raises(SystemExit) as end:
-        cli.run_command(command)
-    message = "jumper: out of memory: Failed to allocate 1048576 bytes on device 'cuda:0'; use fewer worlds\n"
-    assert (end.value.code, capsys.readouterr().err) == (1, message)

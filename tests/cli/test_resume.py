@@ -90,43 +90,16 @@ def test_robot_flag_overrides_the_robot_of_the_run(run, tmp_path):
         assert saved["values"]["spring_stiffness"] == [stiffness]
 
 
-def test_solver_of_the_run_is_restored(run):
-    resave(run, env={"solver": "SolverMuJoCo"})
-    assert parse_train(["vertical-jump", "--resume", str(run)])[0].solver == "mujoco"
-    assert parse_train(["vertical-jump", "--resume", str(run), "--solver", "jumper"])[0].solver == "jumper"
-
-
-def resave(run, train=None, env=None, lacks=()):
-    """Save the run's checkpoint with changed settings of training and environment; lacks: names to leave out of env."""
+def test_solver_of_the_run_is_restored_and_missing_settings_have_defaults(run):
     path = run / "checkpoints" / "iteration_000001.pt"
     state = load_checkpoint(path)
     saved = json.loads(state["config"])
-    saved["train"] |= train or {}
-    saved["env"] = {key: value for key, value in (saved["env"] | (env or {})).items() if key not in lacks}
+    saved["env"] = {key: value for key, value in saved["env"].items() if key not in ("noise", "randomize")}
+    saved["env"]["solver"] = "SolverMuJoCo"
     save_checkpoint(path.parent, state | {"config": json.dumps(saved)})
-
-
-def test_settings_missing_from_the_run_have_defaults(capsys, run):
-    resave(run, lacks=("noise", "randomize"))
     recipe, _ = parse_train(["vertical-jump", "--resume", str(run)])
-    assert (recipe.noise, recipe.randomize, recipe.task.gravity) == (True, True, 3.71)
-    err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize", "--no-noise")[2]
-    assert changed_settings(err) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> False"]
-
-
-def test_refuses_other_noise_than_the_run_has_by_name(capsys, run):
-    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--noise")
-    assert code == 2 and "saved with noise False, this environment has noise True" in err[-1]
-
-
-def test_finished_run_names_the_flag_that_extends_it(capsys, run):
-    code, _, err = train(capsys, "--resume", str(run))
-    assert code == 0 and err[-1] == "the training is complete at iteration 1: raise --max-iterations 1 to continue"
-
-
-def test_refuses_settings_that_do_not_fit_the_checkpoint(capsys, run):
-    code, _, err = train(capsys, "--resume", str(run), "--num-envs", "8")
-    assert code == 2 and "does not fit these settings: " in err[-1] and err[-1].endswith("(num-envs 4 -> 8)")
+    assert (recipe.solver, recipe.noise, recipe.randomize, recipe.task.gravity) == ("mujoco", True, True, 3.71)
+    assert parse_train(["vertical-jump", "--resume", str(run), "--solver", "jumper"])[0].solver == "jumper"
 
 
 @pytest.fixture(scope="module")
@@ -154,11 +127,21 @@ def test_refuses_changes_of_what_is_sampled_at_startup(capsys, startup, tmp_path
     assert fixed is None or f"does not fit these settings: {fixed} cannot change after the start" in err[-1]
 
 
-def test_refuses_another_latency_of_a_nominal_robot(capsys, run, tmp_path):
-    overlay = json.dumps(config(run)["env"]["robot"] | {"values": {"latency": [0.008]}})
-    (tmp_path / "late.json").write_text(overlay)
-    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--robot", str(tmp_path / "late.json"))
-    assert code == 2 and "robot.values.latency cannot change after the start of a training" in err[-1]
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--max-iterations", "2", "--noise"], 2, "saved with noise False, this environment has noise True"),
+        (["--num-envs", "8"], 2, "does not fit these settings: "),
+        (["--max-iterations", "2", "--robot", "late.json"], 2, "robot.values.latency cannot change after the start"),
+        ([], 0, "the training is complete at iteration 1: raise --max-iterations 1 to continue"),
+    ],
+)
+def test_last_line_names_what_does_not_fit_the_run(capsys, run, monkeypatch, flags, code, message):
+    monkeypatch.chdir(run)
+    overlay = config(run)["env"]["robot"] | {"values": {"latency": [0.008]}}
+    (run / "late.json").write_text(json.dumps(overlay))
+    found, _, err = train(capsys, "--resume", str(run), *flags)
+    assert found == code and message in err[-1]
 
 
 def test_refuses_run_of_another_task(capsys, run):

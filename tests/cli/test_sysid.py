@@ -87,24 +87,3 @@ def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
     assert end.value.code == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "motions 1 (0_hung_chirp) and 5 (0_hung_chirp) are the same recording: give it once" in error
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        ([], "recorded motions come first"),
-        (["nowhere.npz"], "nowhere.npz"),
-        (["."], "no npz or csv file"),
-        (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--exclude", "kd,kq"], "unknown parameter 'kq' to exclude"),
-        (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
-        (["x.npz", "--noise.angle", "0"], "noise angle must be in 1e-06 to 90 deg"),
-    ],
-)
-def test_invalid_input_prints_one_line(args, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        main(["sysid", *args])
-    assert end.value.code == 2
-    error = capsys.readouterr().err.strip()
-    assert words in error and len(error.splitlines()) == 1

@@ -1,7 +1,6 @@
 """Gymnasium: autoreset modes, vector wrappers, one-world environments, statistics of episodes."""
 
-import copy
-import pickle
+import dataclasses
 
 import gymnasium
 import numpy as np
@@ -15,6 +14,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.gym import env_id
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.randomization import RandomizationCfg
 
 N, STEPS, LIMIT = 6, 40, 12
 TASK = make_task("vertical-jump").with_terms("terminations", too_long={"steps": float(LIMIT)}, tilted={"angle": 0.15})
@@ -27,6 +27,11 @@ pytestmark = pytest.mark.filterwarnings("error::UserWarning")
 
 def vector(mode=AutoresetMode.SAME_STEP, task=TASK, seed=3, **arguments) -> GymVectorEnv:
     return GymVectorEnv(Env(task, N, device="cpu", seed=seed), autoreset_mode=mode, **arguments)
+
+
+def plain(**arguments) -> Env:
+    """Return the environment that `vector` wraps; arguments: of `Env`."""
+    return Env(TASK, N, device="cpu", seed=3, **arguments)
 
 
 def play(envs, steps=STEPS):
@@ -44,23 +49,31 @@ def play(envs, steps=STEPS):
 
 
 @pytest.mark.parametrize("tensors", [False, True])
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
-def test_step_that_ends_an_episode_returns_its_last_observation(mode, tensors):
-    envs, unreset = vector(mode, tensors=tensors), Env(TASK, N, device="cpu", seed=3, auto_reset=False)
-    envs.reset(), unreset.reset()
+@pytest.mark.parametrize("mode", MODES)
+def test_step_that_ends_an_episode_has_its_last_observation_and_termination(mode, tensors):
+    envs, unreset, reset = vector(mode, tensors=tensors), plain(auto_reset=False), plain()
+    for each in (envs, unreset, reset):
+        each.reset()
     first = np.ones(N, dtype=bool)  # worlds in their first episode, where the environment without resets can follow
+    same_step = mode is AutoresetMode.SAME_STEP
     for action in ACTIONS:
         *values, infos = envs.step(action)
-        obs, reward, terminated, truncated = map(np.asarray, values)
-        old = unreset.step(torch.from_numpy(action))
-        for new, expected in ((obs, old.obs["actor"]), (reward, old.reward), (terminated, old.terminated),
-                              (truncated, old.truncated)):  # fmt: skip
-            np.testing.assert_array_equal(new[first], expected.numpy()[first])
+        obs, reward, terminated, truncated = map(np.array, values)
+        old, new = unreset.step(torch.from_numpy(action)), reset.step(torch.from_numpy(action))
         ended = terminated | truncated
+        assert ("final_obs" in infos) == (same_step and (tensors or ended.any()))
+        if same_step:
+            np.testing.assert_array_equal(obs, new.obs["actor"])
+            for world in np.flatnonzero(ended):
+                assert not np.array_equal(obs[world], infos["final_obs"][world])
+                obs[world] = infos["final_obs"][world]
+            infos = infos.get("final_info", infos)
+        for found, expected in ((obs, old.obs["actor"]), (reward, old.reward), (terminated, old.terminated),
+                                (truncated, old.truncated)):  # fmt: skip
+            np.testing.assert_array_equal(found[first], expected.numpy()[first])
         np.testing.assert_array_equal(np.asarray(infos.get("_termination", np.zeros(N, dtype=bool))), ended)
         for world in np.flatnonzero(ended):
             assert (envs.endings[infos["termination"][world]] in ("too_long", "success")) == truncated[world]
-        assert not {"final_obs", "final_info"} & infos.keys()
         first &= ~ended
         if mode is AutoresetMode.DISABLED and ended.any():
             envs.reset(options={"reset_mask": ended})
@@ -132,6 +145,63 @@ def test_commands_are_resampled_within_an_episode(mode):
     assert (same.env.task_arrays()["command"] != command).any()
 
 
+# ---------------------------------------------------------------- spaces, data and seeds
+
+
+@pytest.mark.parametrize("all_groups", [False, True])
+def test_step_results_are_in_their_spaces(all_groups):
+    envs = vector(all_groups=all_groups)
+    assert envs.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (12,))
+    space = envs.single_observation_space
+    assert (space["actor"] if all_groups else space).shape == (envs.env.num_obs,)
+    obs, infos = envs.reset(seed=1)
+    assert obs in envs.observation_space and infos == {}
+    results = play(envs)
+    for obs, reward, terminated, truncated, _ in results:
+        assert obs in envs.observation_space
+        assert (reward.shape, reward.dtype) == ((N,), np.float32)
+        assert (terminated.shape, terminated.dtype) == (truncated.shape, truncated.dtype) == ((N,), np.bool_)
+    finals = [row for *_, infos in results for row in infos.get("final_obs", []) if row is not None]
+    assert len(finals) > N
+    assert all(row in space for row in finals)
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+def test_step_results_are_copies(tensors):
+    envs = vector(tensors=tensors)
+    actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
+    results = [envs.reset(seed=2)[0]]
+    for *values, infos in [envs.step(action) for action in actions[:13]]:
+        results += [*values, *(infos[name] for name in ("_final_obs", "_final_info") if name in infos)]
+    copies = [value.clone() if tensors else value.copy() for value in results]
+    for action in actions[13:]:
+        envs.step(action)
+    for value, copy in zip(results, copies, strict=True):
+        np.testing.assert_array_equal(value, copy)
+
+
+@pytest.mark.parametrize("resample_at", ["reset", "startup"])
+def test_reset_with_a_seed_equals_a_new_environment_with_it(resample_at):
+    task = dataclasses.replace(TASK, randomization=RandomizationCfg(resample_at=resample_at))
+    envs, new = (vector(task=task, seed=seed) for seed in (1, 5))
+    envs.reset()
+    play(envs)
+    envs.env.episodes.level.fill_(2)  # as after promotions by the curriculum
+    np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
+    for step, other in zip(play(envs), play(new), strict=True):
+        for value, expected in zip(step[:4], other[:4], strict=True):
+            np.testing.assert_array_equal(value, expected)
+    np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
+
+
+def test_equal_seeds_reproduce_and_others_differ():
+    envs = vector()
+    first, other, again = (envs.reset(seed=seed)[0] for seed in (5, 6, 5))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any(axis=1).all()
+    assert (envs.reset()[0] != first).any(axis=1).all()  # without a seed the random numbers continue
+
+
 # ---------------------------------------------------------------- infos
 
 
@@ -192,11 +262,3 @@ def test_end_of_an_episode_is_explained():
         env.step(ACTIONS[0, 0])
     env.reset()
     env.step(ACTIONS[0, 0])
-
-
-@pytest.mark.parametrize("copied", [pickle.dumps, copy.deepcopy])
-def test_pickle_and_deep_copy_are_refused_with_the_reason(copied):
-    for envs in (vector(), GymEnv(Env(TASK, 1, device="cpu"))):
-        envs.reset()
-        with pytest.raises(TypeError, match=r"Env can be neither copied nor pickled: .*make another one"):
-            copied(envs)

@@ -1,5 +1,6 @@
 """rsl-rl: random network distillation, W&B, and its checkpoints as policies of this project."""
 
+import dataclasses
 import json
 import re
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from rsl_rl.runners import OnPolicyRunner
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jumper_warp.cli import evaluate, export, play
 from jumper_warp.envs.env import Env
@@ -14,14 +16,18 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import CheckpointError
+from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config
+from jumper_warp.rl.training_run import LEARNING, PERF
 from toy_task import SMALL
 
-N = 8
+N = 16
+SHORT = make_task("vertical-jump").with_terms("terminations", too_long={"steps": 12.0}, tilted={"angle": 0.15})
+"""Task whose episodes end by time and by failure within a few steps."""
 
 
-def adapter(task="vertical-jump"):
-    env = RslRlVecEnv(Env(make_task(task), N, device="cpu", seed=3))
+def adapter(task=None, **arguments):
+    env = RslRlVecEnv(Env(task or make_task("vertical-jump"), N, device="cpu", seed=3), **arguments)
     env.reset()
     return env
 
@@ -88,10 +94,41 @@ def test_checkpoint_without_the_environments_configuration_is_refused(trained, t
     path.write_bytes((trained[0] / "model_1.pt").read_bytes())
     with pytest.raises(CheckpointError, match=re.escape(f"{path}: needs config.json beside it")):
         Policy.load(path)
-    path.with_name("config.json").write_text("{")
-    with pytest.raises(CheckpointError, match=r"config\.json: not JSON"):
-        Policy.load(path)
     path.with_name("config.json").write_text("{}")
     torch.save([1], path)
     with pytest.raises(CheckpointError, match=r"model_7\.pt: not a training checkpoint"):
         Policy.load(path)
+
+
+def test_value_bootstraps_time_outs_but_not_failures(one_thread):
+    torch.manual_seed(0)
+    env = adapter(SHORT)
+    obs, _ = env.reset()
+    config = rsl_rl_config(dataclasses.replace(SMALL, gamma=0.9), 100, 0)
+    algorithm = OnPolicyRunner(env, config, log_dir=None, device="cpu").alg
+    rewards, dones, time_outs = [], [], []
+    with torch.inference_mode():
+        for _ in range(SMALL.num_steps):
+            obs, reward, done, extras = env.step(algorithm.act(obs))
+            rewards.append(reward.clone())
+            dones.append(done)
+            time_outs.append(extras["time_outs"])
+            algorithm.process_env_step(obs, reward, done, extras)
+    reward, done, time_out = torch.stack(rewards), torch.stack(dones), torch.stack(time_outs)
+    stored, value = algorithm.storage.rewards.squeeze(-1), algorithm.storage.values.squeeze(-1)
+    torch.testing.assert_close(stored, reward + 0.9 * time_out * value)
+    assert time_out.any() and (done.bool() & ~time_out.bool()).any()
+    assert (stored - reward)[time_out.bool()].abs().min() > 1.0e-4
+
+
+def test_log_has_the_keys_of_this_packages_trainer(tmp_path, one_thread):
+    env = adapter(SHORT, metrics_every=SMALL.num_steps)
+    OnPolicyRunner(env, rsl_rl_config(SMALL, 1, 0), log_dir=str(tmp_path), device="cpu").learn(2)
+    assert (tmp_path / "model_1.pt").exists()
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert [event.step for event in events.Scalars("Episode_Termination/too_long")] == [0, 1]
+    theirs = {name for name in events.Tags()["scalars"] if not name.endswith("/time")}
+    metrics = env.env.metrics().keys()
+    assert metrics | {"Train/mean_reward", "Train/mean_episode_length"} <= theirs
+    assert theirs - metrics <= {*PERF, *LEARNING, *(f"Loss/{name}" for name in STATISTICS)}

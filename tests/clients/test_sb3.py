@@ -50,13 +50,6 @@ def test_steps_and_infos_are_those_of_the_vector_environment():
     assert {"too_long", "tilted"} <= ends
 
 
-def test_seed_reproduces_the_first_observations():
-    envs, other = Sb3VecEnv(vector()), vector()
-    envs.seed(7)
-    np.testing.assert_array_equal(envs.reset(), other.reset(seed=7)[0])
-    assert (envs.reset() != other.reset(seed=7)[0]).any()  # a seed counts once
-
-
 def test_sb3s_wrappers_and_evaluation_work():
     envs = VecNormalize(VecMonitor(Sb3VecEnv(vector())))
     envs.reset()

@@ -9,9 +9,28 @@ from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.comparison import compare
 from jumper_warp.compare.report import DATA, PAGE, PICTURE, markdown, write_report
 from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.utils.errors import InputError
-from saved_runs import save_run
+
+
+def save_run(root, name, seed, success, *, weight=None, rewards=None, start=0):
+    """Write the run `name` of a seed with logged successes, and return its folder; rewards: last terms by name."""
+    recipe = Recipe.of("vertical-jump").to_json()
+    recipe["train"] |= {"seed": seed, "run_name": name, "num_envs": 8}
+    if weight is not None:
+        recipe["env"]["task"]["rewards"][0]["weight"] = weight
+    folder = root / "vertical-jump" / f"2026-01-01_00-00-{start:02d}_00000{seed}+0000_{name}"
+    folder.mkdir(parents=True)
+    (folder / CONFIG).write_text(json.dumps(recipe))
+    rows = [
+        {"iteration": 10 * (i + 1), "Perf/elapsed_s": 2.0 * (i + 1), "Metrics/success": value}
+        | {f"Episode_Reward/{term}": reward for term, reward in (rewards or {}).items()}
+        for i, value in enumerate(success)
+    ]
+    (folder / METRICS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
 
 
 @pytest.fixture
@@ -43,9 +62,28 @@ def test_runs_of_an_arm_must_have_equal_settings(runs):
         find_arms([f"both={runs}"])
 
 
-def test_a_pattern_without_runs_is_refused(runs):
-    with pytest.raises(InputError, match="no such run"):
-        find_arms([runs / "bass*"])
+@pytest.mark.parametrize(
+    ("sources", "settings", "message"),
+    [
+        (("bass*", "tuck"), {}, "no such run"),
+        (("base",), {}, "a comparison needs two arms, got base"),
+        (("base", "tuck", ".."), {}, "no run in this folder"),
+        (("base", "tuck", "several:7"), {}, "no seed 7; seeds: 1, 2"),
+        (("base", "broken"), {}, "no settings of a training"),
+        (("base", "no_seed"), {}, r"config\.json: no settings of a training"),
+        (("base", "tuck"), {"primary": "success"}, "there are iteration, Perf/elapsed_s, Metrics/success"),
+        (("base", "tuck"), {"metric": "success"}, "no run has logged success; base has logged iteration"),
+    ],
+)
+def test_sources_and_metrics_that_do_not_exist_are_refused(runs, sources, settings, message):
+    for name in ("seed_1", "seed_2"):
+        (runs / "several" / name).mkdir(parents=True)
+    saved = json.loads((next(runs.glob("*_base")) / "config.json").read_text())
+    for name, config in (("broken", None), ("no_seed", saved | {"train": saved["train"] | {"seed": None}})):
+        (runs / name).mkdir()
+        (runs / name / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=message):
+        _ = compared(runs, *sources, **settings).primary
 
 
 def test_separated_arms_of_five_seeds_differ(runs):
@@ -112,11 +150,6 @@ def test_the_page_shows_the_changes_of_the_users_files(runs):
     assert "\n import warp\n-WEIGHT = 1\n+WEIGHT = 2\n" in page
 
 
-def test_a_single_arm_is_refused(runs):
-    with pytest.raises(InputError, match="a comparison needs two arms, got base"):
-        compared(runs, "base")
-
-
 def test_policies_are_evaluated_with_changed_flags():
     comparison = compare("vertical_jump", "mars_vertical_jump", evaluation={"num_jumps": 4})
     assert comparison.primary_name == "success_rate"
@@ -125,8 +158,7 @@ def test_policies_are_evaluated_with_changed_flags():
 
 
 @pytest.mark.parametrize(
-    "line",
-    [b"null", b"{}", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}', b'{"iteration": 3, "a": 1e308}'],
+    "line", [b"null", b'{"iteration": 3', b"\xff", b'{"iteration": 3, "a": "x"}', b'{"iteration": 3, "a": 1e308}']
 )
 def test_a_malformed_line_of_metrics_is_named(runs, line):
     folder = save_run(runs.parent, "base", 3, [0.9], start=7)
@@ -142,40 +174,6 @@ def test_an_unfinished_line_of_metrics_does_not_count(runs):
     assert compared(runs, "base", "tuck").primary[0].values[2] == 0.9
 
 
-@pytest.mark.parametrize(
-    ("sources", "message"),
-    [
-        (("base", "tuck", ".."), "no run in this folder"),
-        (("base", "tuck", "several:7"), "no seed 7; seeds: 1, 2"),
-        (("base", "broken"), "no settings of a training"),
-        (("base", "tuck", "file.pt"), "is a file"),
-    ],
-)
-def test_a_source_without_the_named_run_is_refused(runs, sources, message):
-    for name in ("seed_1", "seed_2"):
-        (runs / "several" / name).mkdir(parents=True)
-    (runs / "broken").mkdir()
-    (runs / "broken" / "config.json").write_text("null")
-    (runs / "file.pt").write_bytes(b"")
-    with pytest.raises(InputError, match=message):
-        compared(runs, *sources)
-
-
-@pytest.mark.parametrize("source", ["x=", "=vertical_jump"])
-def test_an_arm_has_a_name_and_a_source(source):
-    with pytest.raises(InputError, match="NAME=SOURCE"):
-        find_arms([source])
-
-
-def test_a_missing_metric_is_refused_with_the_logged_ones(runs):
-    with pytest.raises(InputError, match="there are iteration, Perf/elapsed_s, Metrics/success"):
-        _ = compared(runs, "base", "tuck", primary="Metrics/sucess").primary
-    with pytest.raises(InputError, match="no run has logged Metrics/sucess; base has logged iteration"):
-        compared(runs, "base", "tuck", metric="Metrics/sucess")
-    with pytest.raises(InputError, match="vertical_jump has logged nothing"):
-        compare("vertical_jump", runs / "base", metric="Metrics/sucess")
-
-
 def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
     primary = compared(runs, "base", "tuck", primary="-steps_to_80_percent").primary
     base, tuck = primary
@@ -184,14 +182,6 @@ def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
     assert tuck.improvement == pytest.approx(0.5)
     first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
     assert (first.improvement, first.verdict) == (1.0, "better")
-
-
-def test_equal_values_of_all_seeds_are_noted(tmp_path):
-    for name in ("base", "tuck"):
-        for seed in range(1, 6):
-            save_run(tmp_path, name, seed, [0.0], weight=7.0 if name == "tuck" else 4.0)
-    text = markdown(compared(tmp_path / "vertical-jump", "base", "tuck"))
-    assert "**All seeds have the same Metrics/success**" in text
 
 
 def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
@@ -208,26 +198,10 @@ def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
     assert len(evaluated) == 1
 
 
-@pytest.mark.parametrize("name", ["a$b", "$x$$", r"$\frac$"])
+@pytest.mark.parametrize("name", ["a$b", r"$\frac$"])
 def test_names_and_titles_are_not_mathematics(runs, tmp_path, name):
     comparison = compare(f"{name}={runs}/base", f"{name}b={runs}/tuck", evaluate=False, title=f"of {name}")
     assert write_report(comparison, tmp_path).exists()
-
-
-@pytest.mark.parametrize(
-    ("section", "values"),
-    [
-        ("train", {"seed": None}), ("train", {"seed": "x"}), ("train", {"seed": [1]}), ("train", {"ppo": {}}),
-        ("train", {"num_envs": "8"}), ("env", None), ("env", {"task": None}), ("env", {"task": "x"}),
-    ],
-)  # fmt: skip
-def test_damaged_settings_of_a_run_are_named(runs, section, values):
-    path = next(runs.glob("*_base")) / "config.json"
-    config = json.loads(path.read_text())
-    config[section] = values and config[section] | values
-    path.write_text(json.dumps(config))
-    with pytest.raises(InputError, match=r"config\.json: no settings of a training"):
-        compared(runs, "base", "tuck")
 
 
 def test_a_seed_without_the_metric_of_the_best_checkpoint_has_no_steps_to_a_share(runs, tmp_path):
@@ -248,13 +222,3 @@ def test_a_reader_that_closes_the_pipe_does_not_lose_the_page(runs, tmp_path):
     with closed_pipe():
         main(["compare", str(runs / "base"), str(runs / "tuck"), "--no-evaluate", "--out", str(tmp_path / "out")])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {PICTURE, PAGE, DATA}
-
-
-def test_whether_to_evaluate_is_a_flag(runs):
-    with pytest.raises(InputError, match="evaluate must be True or False, got 'no'"):
-        compare(runs / "base", runs / "tuck", evaluate="no")
-
-
-def test_a_flag_of_the_evaluation_of_another_shape_is_refused():
-    with pytest.raises(InputError, match="evaluation: too many values"):
-        compare("vertical_jump", "mars_vertical_jump", evaluation={"height_range": (1.0, 2.0, 3.0)})

@@ -1,32 +1,18 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from closed_pipe import closed_pipe
-from jump_helpers import make_env, random_actions
 from jumper_warp.cli.main import main
 from jumper_warp.compare.motions import compare_motions
-from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.registry import make_task
+from recordings import record_jumps
 
-
-def recorded(height, seconds):
-    """Return a recording of a robot with random actions, after a command of a height [m]."""
-    env, log = make_env(1), JumpLog(np.full(1, height), make_task("vertical-jump").termination_names)
-    recorder = EnvRecorder(env, log, [0], notes={"task": "vertical-jump", "policy": "random"})
-    actions = iter(random_actions(1, 60))
-    run_evaluation(
-        lambda obs: next(actions), env, log, seconds=seconds, on_begin=recorder.begin, on_step=recorder, stop=False
-    )
-    return recorder.recording()
+MOTIONS = (("low", 0.5, 18), ("high", 0.9, 30))  # name, commanded height [m], policy steps
 
 
 @pytest.fixture(scope="module")
 def motions():
-    return {"low": recorded(0.5, 0.3), "high": recorded(0.9, 0.5)}
+    return {name: record_jumps([height], steps, [0]).recording() for name, height, steps in MOTIONS}
 
 
 def test_motions_begin_together_and_the_shorter_one_ends_in_its_last_pose(motions):
@@ -52,17 +38,11 @@ def test_a_plot_has_one_reward_term_of_all_motions_and_the_sum_comes_first(motio
     np.testing.assert_allclose(total.sum() - so_far.sum(), so_far[-1], rtol=1e-5)
 
 
-def test_play_writes_picture_and_recording_of_two_recordings(motions, tmp_path):
-    for name, recording in motions.items():
-        replace(recording, notes={"task": "vertical-jump"}).save_npz(tmp_path / f"{name}.npz")
-    main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", "--out", str(tmp_path / "out")])
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
-
-
-def test_a_reader_that_closes_the_pipe_does_not_lose_the_film(motions, tmp_path):
+def test_play_writes_film_picture_and_recording_although_its_reader_closes_the_pipe(motions, tmp_path):
     for name, recording in motions.items():
         recording.save_npz(tmp_path / f"{name}.npz")
     film = ["--video", str(tmp_path / "film.gif"), "--out", str(tmp_path / "out")]
     with closed_pipe():
-        main(["play", f"{tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
+        main(["play", f"first={tmp_path}/low.rrd", f"{tmp_path}/high.rrd", *film])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"motions.png", "motions.rrd"}
     assert (tmp_path / "film.gif").exists()

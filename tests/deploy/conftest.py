@@ -1,10 +1,13 @@
 """A bundle of the shipped policies, and a robot on simulated buses in lockstep."""
 
+import shutil
+
 import pytest
+import yaml
 
 from jumper_warp.bench.bundle import export_bundle
 from jumper_warp.bench.bus_sim import BusSim, make_simulation
-from jumper_warp.deploy.bundle import Bundle
+from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.runtime import Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
@@ -23,6 +26,20 @@ def bundle_folder(tmp_path_factory):
 def bundle(bundle_folder):
     """Bundle of the shipped policies."""
     return Bundle(bundle_folder)
+
+
+@pytest.fixture
+def edited(bundle_folder, tmp_path):
+    """Function that returns a copy of the bundle's folder, whose settings a function changes."""
+
+    def edit(change):
+        folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
+        settings = yaml.safe_load((folder / FILE).read_text())
+        change(settings)
+        (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
+        return folder
+
+    return edit
 
 
 class Robot:

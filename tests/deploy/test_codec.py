@@ -4,7 +4,7 @@ import cantools
 import numpy as np
 import pytest
 
-from jumper_warp.deploy.codec import ENTER, EXIT, ZERO, Codec, Reply, dbc
+from jumper_warp.deploy.codec import ENTER, EXIT, ZERO, Codec, dbc
 
 KINDS = ("AK80-9", "AK70-10", "AK70-10")
 COUNT = 33_334  # frames of each of three motors: 1e5 each way
@@ -69,10 +69,3 @@ def test_no_command_is_a_special_frame():
     # the special frames have the code 0xFFF of kp, bytes 3 (low half) and 4, which no command reaches
     assert all((frame[3] & 15, frame[4]) == (15, 255) for frame in (ENTER, EXIT, ZERO))
     assert codec.largest[2].max() == 0xFFE
-
-
-def test_reply_values_are_physical():
-    reply = Codec(KINDS).decode_reply(np.array([[1, 128, 0, 128, 8, 0, 35, 0]] * 3, dtype=np.uint8))
-    assert isinstance(reply, Reply)
-    assert reply.position == pytest.approx([0.0] * 3, abs=2e-4)
-    assert reply.temperature.tolist() == [35.0] * 3

@@ -2,18 +2,14 @@
 
 import errno
 import json
-import os
 import shutil
 import socket
 import threading
-from pathlib import Path
 
 import can
 import numpy as np
 import pytest
-import yaml
 
-from jumper_warp.cli.bus_sim import run as bus_sim
 from jumper_warp.cli.export import run as export
 from jumper_warp.deploy import bus, main
 from jumper_warp.deploy.bundle import FILE, Bundle
@@ -32,9 +28,7 @@ def refusal(capsys, *args):
 
 
 @pytest.mark.parametrize(
-    "text",
-    [b"", b"- 1\n", b"a: [1,\n", b"version: 1\n", bytes(range(256))],
-    ids=["no", "list", "cut", "short", "bytes"],
+    "text", [b"", b"- 1\n", b"version: 1\n", bytes(range(256))], ids=["no", "list", "short", "bytes"]
 )
 def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
     folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
@@ -44,54 +38,24 @@ def test_settings_that_are_none_are_refused(text, bundle_folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("place", "value"),
+    ("flags", "message"),
     [
-        (("joint_ids_map",), [0, 1, 2]), (("joint_offsets",), [float("nan")] * 12), (("hold", "damping"), [1.0, 2.0]),
-        (("torque_curve",), {}), (("policies",), []), (("files",), None), (("estimator",), None), (("safety",), {}),
-        (("policies", "vertical_jump", "stiffness"), [1.0, 2.0]), (("policies", "vertical_jump", "commands"), None),
-        (("safety", "damping"), []), (("policies", "vertical_jump", "observations", "angle", "scale"), []),
-        (("policies", "vertical_jump", "actions", "JointPositionAction", "scale"), [1.0, 2.0]),
-        (("policies", "vertical_jump", "command_filter"), {}), (("policies", "vertical_jump", "skill"), "fly"),
-        (("stand_up",), {"seconds": 2.0}), (("stand_up", "folded"), [0.0] * 4), (("stand_up", "seconds"), "two"),
-        (("switch",), {"rest_speed": 0.1}), (("safety", "max_late"), None), (("safety", "max_tilt"), []),
+        (["--seconds=0"], "seconds above 0"),
+        (["--seconds=nan"], "seconds above 0"),
+        (["--height=nan"], "height and place must be finite"),
+        (["--place", "inf", "0"], "height and place must be finite"),
+        (["--bus=unix:"], "bus must be"),
     ],
-    ids=lambda x: x[-1] if isinstance(x, tuple) else "",
-)  # fmt: skip
-def test_wrong_setting_is_refused_by_the_check(place, value, bundle_folder, tmp_path):
-    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
-    settings = yaml.safe_load((folder / FILE).read_text())
-    section = settings
-    for name in place[:-1]:
-        section = section[name]
-    section[place[-1]] = value
-    (folder / FILE).write_text(yaml.safe_dump(settings, sort_keys=False))
-    with pytest.raises(InputError, match=r"deploy\.yaml"):
-        check_bundle(Bundle(folder))
-
-
-@pytest.mark.parametrize("rate", [0, -480, "abc", 1000])
-def test_wrong_rate_is_refused(rate, bundle_folder, tmp_path, capsys):
-    folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
-    settings = yaml.safe_load((folder / FILE).read_text())
-    (folder / FILE).write_text(yaml.safe_dump(settings | {"rate": rate}, sort_keys=False))
-    assert "rate must be" in refusal(capsys, folder, "--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
-
-
-@pytest.mark.parametrize("seconds", [0, -1, "nan"])
-def test_wrong_time_is_refused(seconds, bundle_folder, tmp_path, capsys):
-    assert "seconds above 0" in refusal(capsys, bundle_folder, "--bus", f"unix:{tmp_path}/bus", f"--seconds={seconds}")
-
-
-@pytest.mark.parametrize("flags", [("--height", "nan"), ("--place", "inf", "0")])
-def test_goal_of_the_keys_that_is_not_finite_is_refused(flags, bundle_folder, tmp_path, capsys):
-    bus = ("--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
-    assert "height and place must be finite" in refusal(capsys, bundle_folder, *bus, *flags)
-
-
-def test_bus_without_a_folder_is_refused(bundle_folder, tmp_path, monkeypatch, capsys):
+)
+def test_wrong_flag_is_refused(flags, message, bundle_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert "bus must be" in refusal(capsys, bundle_folder, "--bus", "unix:", "--seconds", 0.01)
-    assert not list(tmp_path.iterdir())
+    assert message in refusal(capsys, bundle_folder, "--bus=unix:bus", "--seconds=0.01", *flags)
+
+
+@pytest.mark.parametrize("rate", [0, "abc", 1000])
+def test_wrong_rate_is_refused(rate, edited, tmp_path, capsys):
+    folder = edited(lambda settings: settings.update(rate=rate))
+    assert "rate must be" in refusal(capsys, folder, "--bus", f"unix:{tmp_path}/bus", "--seconds", 0.01)
 
 
 def test_folder_of_a_running_process_is_refused(bundle_folder, tmp_path, capsys):
@@ -195,8 +159,7 @@ ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsiz
 @pytest.mark.parametrize(
     ("about", "ticks"),
     [
-        ([1], 3), (ABOUT | {"rate": 0}, 3), (ABOUT | {"rate": "x"}, 3), ({"version": 1}, 3), (ABOUT, 0),
-        (ABOUT | {"capture": None}, 3), (ABOUT, -3),
+        ([1], 3), (ABOUT | {"rate": 0}, 3), ({"version": 1}, 3), (ABOUT, 0), (ABOUT, -3),
     ],
 )  # fmt: skip
 def test_damaged_log_is_refused(about, ticks, tmp_path):
@@ -209,14 +172,6 @@ def test_damaged_log_is_refused(about, ticks, tmp_path):
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize("flags", [["--bundle", "--page", "p"], ["--page", "p", "--out", "q"]])
-def test_flags_of_two_exports_are_refused(flags, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="--page excludes"):
-        export(["vertical_jump", *flags])
-    assert not list(tmp_path.iterdir())
-
-
 def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
     folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
     (folder / "jumper.dbc").write_text("changed")
@@ -225,35 +180,3 @@ def test_bundle_can_be_overwritten(bundle_folder, tmp_path):
     export(["vertical_jump", "--bundle", "--out", str(folder), "--overwrite"])
     assert check_bundle(Bundle(folder)) == []
     assert (folder / "jumper.dbc").read_bytes() == (bundle_folder / "jumper.dbc").read_bytes()
-
-
-@pytest.mark.parametrize(
-    "flag", [("--rate", "0"), ("--seed", "-1"), ("--drop", "2"), ("--corrupt", "-1"), ("--seconds", "-1")]
-)
-def test_wrong_number_of_the_simulated_buses_is_refused(flag, tmp_path):
-    with pytest.raises(InputError, match=flag[0].strip("-")):
-        bus_sim(["--bus", f"unix:{tmp_path}", "--seconds", "0.01", *flag])
-
-
-def process_state():
-    """Return the scheduling policy of this process, and the line about its locked memory."""
-    status = Path("/proc/self/status").read_text().splitlines()
-    return os.sched_getscheduler(0), next(line for line in status if line.startswith("VmLck"))
-
-
-@pytest.mark.parametrize("end", ["runtime", "robot"])
-def test_process_has_neither_real_time_priority_nor_locked_memory_afterwards(end, bundle_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.stdin", None)
-    before = process_state()
-    flags = ["--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"]
-    if end == "runtime":
-        main.main([str(bundle_folder), *flags])
-    else:
-        bus_sim(flags)
-    assert process_state() == before
-
-
-def test_closed_standard_input_is_no_terminal(bundle_folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stdin", None)
-    main.main([str(bundle_folder), "--bus", f"unix:{tmp_path}/bus", "--seconds", "0.01"])
-    assert '"ticks"' in capsys.readouterr().out

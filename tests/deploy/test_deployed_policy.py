@@ -31,21 +31,6 @@ TUTORIAL = ROOT / "docs" / "tutorials" / "on_a_robot.md"
 COMMAND_STEP, HEIGHT = 30, 0.9  # policy step of the command to jump; commanded base height [m]
 
 
-def without_history(policy, readings):
-    """Clear the policy's history before a step; return the readings unchanged."""
-    policy._observation = policy._observation[:0]
-    return readings
-
-
-MISTAKES = {
-    "no default pose": lambda policy, r: r | {"angle": r["angle"] + policy.default},
-    "default pose twice": lambda policy, r: r | {"angle": r["angle"] - policy.default},
-    "no history": without_history,
-    "gravity upward": lambda policy, r: r | {"gravity": -r["gravity"]},
-}
-"""Mistakes of a deployment program by name: a function that makes it."""
-
-
 def onnx_of(name):
     """Return the `DeployedPolicy` of a shipped policy."""
     return DeployedPolicy(find_policy(name) / "policy.onnx")
@@ -79,12 +64,6 @@ def way_to(place, robot):
     return np.array([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x])
 
 
-def simulated_robot(lateral_torque):
-    """Return a simulated robot with motors of 18 N m, lateral ones of `lateral_torque` [N m]."""
-    motors = jumping_motors(18.0, lateral_torque=lateral_torque)
-    return Simulation(1, motors=motors, friction=0.85, device="cpu")
-
-
 @pytest.fixture(scope="module")
 def environment_apex():
     """Apex [m] of the policy's jump to HEIGHT in the environment."""
@@ -101,24 +80,6 @@ def environment_apex():
 def test_jump_to_a_height_is_that_of_the_environment(environment_apex):
     apex, _ = jump()
     assert apex == pytest.approx(environment_apex, abs=0.004)  # [m]; 0.877
-
-
-def test_jump_to_a_place_ends_there():
-    policy, robot = onnx_of("horizontal_jump"), simulated_robot(12.0)
-    place = robot.joint_q()[0, XY] + [0.8, 0.2]  # [m]
-    for tick in range(180):  # 3 s
-        goal = way_to(place, robot) if tick >= COMMAND_STEP else np.zeros(2)
-        robot.set_targets(policy.targets({**robot_readings(robot), "goal": goal}))
-        robot.step()
-    assert np.linalg.norm(robot.joint_q()[0, XY] - place) < 0.03  # [m]
-
-
-def test_interface_has_first_column_end_and_history_of_each_observation_term():
-    layout = onnx_of("horizontal_jump").interface["observation_layout"]
-    assert [f"{name} {term['first']} {term['end']} {term['history']}" for name, term in layout.items()] == [
-        "goal 0 2 1", "height 2 3 1", "lin_vel 3 15 4", "ang_vel 15 27 4", "gravity 27 39 4", "angle 39 87 4",
-        "rate 87 99 1", "last_action 99 147 4",
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -157,24 +118,21 @@ def test_observations_actions_and_targets_agree_with_the_environment(name, goal,
     assert frame_difference > 0.05  # [m/s] so large that world axes would exceed the tolerance
 
 
-def jump(change=None, delay=0, ticks=180):
+def jump(delay=0, ticks=180):
     """Return apex [m] and number of takeoffs of a vertical jump commanded to HEIGHT.
 
-    change: function of policy and readings that returns the readings to use; delay: policy steps by which the end of
-    the jump command is delayed; ticks: policy steps to simulate.
+    delay: policy steps by which the end of the jump command is delayed; ticks: policy steps to simulate.
     """
-    policy, command, robot = onnx_of("vertical_jump"), JumpCommand(), simulated_robot(10.0)
+    policy, command = onnx_of("vertical_jump"), JumpCommand()
+    robot = Simulation(1, motors=jumping_motors(18.0, lateral_torque=10.0), friction=0.85, device="cpu")
     apex, takeoffs, in_flight, commands = 0.0, 0, False, []
     for tick in range(ticks):
         if tick == COMMAND_STEP:
             command.request()
         up, down = robot.base_velocity()[0, Z], paws_down(robot)
         commands.append(command.update(up, down))
-        readings = robot_readings(robot)
-        if change is not None:
-            readings = change(policy, readings)
         task_readings = {"wanted_height": HEIGHT, "jump_command": max(commands[-1 - delay :])}
-        robot.set_targets(policy.targets(readings | task_readings))
+        robot.set_targets(policy.targets(robot_readings(robot) | task_readings))
         robot.step()
         takeoff = not in_flight and down == 0 and up > 0.75  # [m/s]
         in_flight, takeoffs = down == 0 and (in_flight or takeoff), takeoffs + takeoff
@@ -182,25 +140,9 @@ def jump(change=None, delay=0, ticks=180):
     return apex, takeoffs
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_refused_or_change_the_apex(mistake, environment_apex):
-    try:
-        apex, _ = jump(MISTAKES[mistake])
-    except InputError as refusal:
-        assert re.fullmatch(r"(angle|rate) must be within .*; hold the last target", str(refusal))
-    else:
-        assert abs(apex - environment_apex) > 0.1  # [m]; a right program is within 0.005 m
-
-
 def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(environment_apex):
     apex, takeoffs = jump(delay=9, ticks=480)  # policy steps of 1/60 s
     assert apex == pytest.approx(environment_apex, abs=0.005) and takeoffs == 1
-
-
-@pytest.mark.parametrize(("delay", "least"), [(18, 2), (480, 6)])  # takeoffs; 7 without end
-def test_command_that_stays_set_makes_the_robot_jump_again(delay, least):
-    _, takeoffs = jump(delay=delay, ticks=480)
-    assert takeoffs >= least
 
 
 def test_history_starts_with_the_first_reading_and_shifts_each_step():
@@ -307,10 +249,3 @@ def test_jump_command_ends_with_the_landing():
     # next flight
     steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (0.9, 2), (-1.0, 0), (-1.0, 1), (0.9, 0)]
     assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize("module", ["deploy.policy", "policies.spec"])
-def test_module_imports_neither_torch_nor_warp(module):
-    code = f"import sys, jumper_warp.{module}\nprint([m for m in ('torch', 'warp', 'newton') if m in sys.modules])"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"

@@ -37,62 +37,11 @@ class OffBus:
         return getattr(self.bus, name)
 
 
-def silence(robot):
-    """Silence a motor."""
-    robot.far.silent = {4}
-
-
-def bus_off(robot):
-    """Turn the second bus off."""
-    robot.link.buses[1] = OffBus(robot.link.buses[1])
-
-
-def error_frames(robot):
-    """Turn every frame into an error frame."""
-    robot.far.faults.corrupt = 1.0
-
-
-def over_temperature(robot):
-    """Heat the motors."""
-    robot.far.faults.temperature = 95.0
-
-
-def motor_error(robot):
-    """Let a motor report over-current."""
-    robot.far.faults.error_code = 2
-
-
-def torque(robot):
-    """Let a motor report 25 N m."""
-    robot.far.bias[2, 5] = 25.0
-
-
-def speed(robot):
-    """Let a motor report 50 rad/s."""
-    robot.far.bias[1, 5] = 50.0
-
-
-def position(robot):
-    """Let a motor report an angle beyond its stop."""
-    robot.far.bias[0, 6] = 3.0
-
-
 def tilt(robot):
     """Turn the robot on its side."""
     q = robot.far.sim.state.joint_q.numpy()
     q[2:7] = [0.6, np.sin(0.75), 0.0, 0.0, np.cos(0.75)]
     robot.far.sim.state.joint_q.assign(q)
-
-
-def stale(robot):
-    """Freeze the IMU."""
-    robot.far.imu_frozen = True
-
-
-def diverge(robot):
-    """Let the state source diverge."""
-    source = robot.runtime.source
-    source.update = lambda *readings: source._estimate._replace(diverged=True)
 
 
 def nan_action(robot):
@@ -102,33 +51,40 @@ def nan_action(robot):
     skill.policy._session = SimpleNamespace(run=lambda *inputs: [np.full((1, 12), np.nan, np.float32)])
 
 
-def firmware(robot):
-    """Let the motors reply under their own ids."""
-    robot.far.faults.motor_own_id = True
+def diverge(robot):
+    """Let the state source diverge."""
+    source = robot.runtime.source
+    source.update = lambda *readings: source._estimate._replace(diverged=True)
 
 
-def nothing(robot):
-    """Inject nothing: the fault is an argument of the tick."""
+def reports(row, motor, value):
+    """Return a function that adds a value to the replies of a motor: 0 angle [rad], 1 rate [rad/s], 2 torque [N m]."""
+    return lambda robot: robot.far.bias.__setitem__((row, motor), value)
+
+
+def of_faults(**values):
+    """Return a function that sets values of `BusFaults`."""
+    return lambda robot: vars(robot.far.faults).update(values)
 
 
 FAULTS = {
     # name: injection, fault, ticks from the first one with the fault to damping, arguments of the tick
-    "motor silent": (silence, Fault.SILENT, 5, {}),
-    "bus off": (bus_off, Fault.BUS_OFF, 5, {}),
-    "error frames": (error_frames, Fault.ERROR_FRAME, 5, {}),
-    "over-temperature": (over_temperature, Fault.TEMPERATURE, 1, {}),
-    "motor error": (motor_error, Fault.MOTOR_ERROR, 1, {}),
-    "torque": (torque, Fault.TORQUE, 5, {}),
-    "speed": (speed, Fault.SPEED, 1, {}),
-    "position": (position, Fault.POSITION, 1, {}),
+    "motor silent": (lambda robot: robot.far.silent.add(4), Fault.SILENT, 5, {}),
+    "bus off": (lambda r: r.link.buses.__setitem__(1, OffBus(r.link.buses[1])), Fault.BUS_OFF, 5, {}),
+    "error frames": (of_faults(corrupt=1.0), Fault.ERROR_FRAME, 5, {}),
+    "over-temperature": (of_faults(temperature=95.0), Fault.TEMPERATURE, 1, {}),
+    "motor error": (of_faults(error_code=2), Fault.MOTOR_ERROR, 1, {}),
+    "torque": (reports(2, 5, 25.0), Fault.TORQUE, 5, {}),
+    "speed": (reports(1, 5, 50.0), Fault.SPEED, 1, {}),
+    "position": (reports(0, 6, 3.0), Fault.POSITION, 1, {}),
     "tilt": (tilt, Fault.TILT, 2, {}),  # the state is a tick old
-    "stale IMU": (stale, Fault.STALE, 6, {}),  # the first frozen counter is new
+    "stale IMU": (lambda r: setattr(r.far, "imu_frozen", True), Fault.STALE, 6, {}),  # the first frozen counter is new
     "diverged estimate": (diverge, Fault.DIVERGED, 5, {}),
     "NaN of the policy": (nan_action, Fault.NOT_FINITE, 5 + 8, {}),  # the policy acts every eighth tick
-    "late ticks": (nothing, Fault.LATE, 5, {"late": 2.0e-3}),
-    "a tick 20 ms late": (nothing, Fault.LATE, 1, {"late": 0.02}),
-    "operator's stop": (nothing, Fault.STOP, 1, {"request": Request.STOP}),
-    "wrong firmware id": (firmware, Fault.WRONG_ID, 1, {}),
+    "late ticks": (of_faults(), Fault.LATE, 5, {"late": 2.0e-3}),
+    "a tick 20 ms late": (of_faults(), Fault.LATE, 1, {"late": 0.02}),
+    "operator's stop": (of_faults(), Fault.STOP, 1, {"request": Request.STOP}),
+    "wrong firmware id": (of_faults(motor_own_id=True), Fault.WRONG_ID, 1, {}),
 }
 
 

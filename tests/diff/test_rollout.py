@@ -1,6 +1,5 @@
 """Rollouts: forward pass against the simulation, threads, the PyTorch bridge, and refusals of bad input."""
 
-import copy
 import math
 
 import numpy as np
@@ -161,51 +160,20 @@ def test_gradient_by_q_includes_default_initial_target():
         assert by_q_alone[entry].item() != pytest.approx(expected, rel=1.0e-2)
 
 
-def test_rollouts_and_simulations_can_be_neither_copied_nor_pickled():
-    for made in (rollout(), Simulation(1, device="cpu")):
-        with pytest.raises(TypeError, match=f"{type(made).__name__} can be neither copied nor pickled"):
-            copy.deepcopy(made)
-
-
-def test_second_derivatives_are_refused():
+def test_second_derivatives_and_forward_mode_are_refused():
     of, targets, (q, qd) = rollout(), torch.zeros(2, 12, dtype=torch.float64, requires_grad=True), tensors()
 
     def height(values):
         return simulate(of, values, q, qd).q[-1, Z].sum()
 
-    (first,) = torch.autograd.grad(height(targets), targets)
     for second in (
         lambda: torch.autograd.functional.hessian(height, targets),
-        lambda: torch.autograd.functional.hessian(lambda x: height(x) ** 2, targets),
-        lambda: torch.autograd.functional.hvp(height, targets, torch.ones_like(targets)),
         lambda: torch.autograd.grad(height(targets), targets, create_graph=True),
-        lambda: height(targets).backward(create_graph=True),
     ):
         with pytest.raises(InputError, match="simulate has no second derivatives: create_graph must be False"):
             second()
-    with pytest.raises(RuntimeError):
-        torch.func.hessian(height)(targets.detach())
-    (again,) = torch.autograd.grad(height(targets), targets)
-    assert torch.equal(first, again)
-
-
-def test_forward_mode_is_refused():
-    of, (q, qd) = rollout(), tensors()
-    targets = torch.zeros(2, 12, dtype=torch.float64)
     with pytest.raises(InputError, match="simulate has no forward mode"):
-        torch.func.jvp(lambda values: simulate(of, values, q, qd).q, (targets,), (targets,))
-    with torch.autograd.forward_ad.dual_level(), pytest.raises(InputError, match="simulate has no forward mode"):
-        simulate(of, torch.autograd.forward_ad.make_dual(targets, targets), q, qd)
-
-
-def test_inputs_of_another_type_are_refused():
-    of, targets, (q, qd) = rollout(), np.zeros((2, 12)), squat()
-    for wrong in (targets + 0.5j, targets.astype(str), targets > 0.0):
-        with pytest.raises(InputError, match="targets must be an array of numbers"):
-            of.run(wrong, q, qd)
-    for wrong in (None, "1", 1):
-        with pytest.raises(InputError, match="worlds must be one bool"):
-            of.hold(wrong)
+        torch.func.jvp(height, (targets.detach(),), (targets.detach(),))
 
 
 def test_reverse_pass_refuses_changed_outputs_and_parameters():

@@ -11,23 +11,7 @@ import warp as wp
 from columns import X
 from jumper_warp.diff.bodies import body_gradients, moment_rows
 from jumper_warp.diff.rollout import GEOMETRY_NAMES, Rollout
-from jumper_warp.kernels.layout import (
-    ARMATURE,
-    BASE,
-    DAMPING,
-    FRICTION,
-    GRAVITY,
-    INNER_SHANK,
-    KNEE_DAMPING,
-    LEG_ROWS,
-    LOWER,
-    MU_DYNAMIC,
-    MU_STATIC,
-    OUTER_THIGH,
-    SPRING,
-    STOP_KD,
-    STOP_KE,
-)
+from jumper_warp.kernels import layout
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import vertical_jump_filter
 from tests.helpers.rollout_helpers import (
@@ -43,10 +27,14 @@ from tests.helpers.rollout_helpers import (
     weights,
 )
 
-LEG = int(LEG_ROWS)  # rows of a leg in the parameter table
-MU_ROWS = [leg * LEG + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
-MASSES = [int(BASE), int(BASE) + 1, int(BASE) + 4, int(OUTER_THIGH) + LEG, int(INNER_SHANK) + 3, int(INNER_SHANK) + 6]
-JOINTS = [int(ARMATURE) + 1, int(FRICTION) + 1, int(DAMPING) + LEG, int(KNEE_DAMPING) + 2 * LEG]
+ARMATURE, BASE, DAMPING, FRICTION, GRAVITY, INNER_SHANK, KNEE_DAMPING, LEG, LOWER, MU_DYNAMIC, MU_STATIC = (
+    int(getattr(layout, name)) for name in ("ARMATURE", "BASE", "DAMPING", "FRICTION", "GRAVITY", "INNER_SHANK",
+                                            "KNEE_DAMPING", "LEG_ROWS", "LOWER", "MU_DYNAMIC", "MU_STATIC")
+)  # fmt: skip
+OUTER_THIGH, SPRING, STOP_KD, STOP_KE = map(int, (layout.OUTER_THIGH, layout.SPRING, layout.STOP_KD, layout.STOP_KE))
+MU_ROWS = [leg * LEG + row for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
+MASSES = [BASE, BASE + 1, BASE + 4, OUTER_THIGH + LEG, INNER_SHANK + 3, INNER_SHANK + 6]
+JOINTS = [ARMATURE + 1, FRICTION + 1, DAMPING + LEG, KNEE_DAMPING + 2 * LEG]
 
 
 def jump(**changes) -> dict[str, np.ndarray]:
@@ -70,7 +58,7 @@ def folding() -> dict[str, np.ndarray]:
     """Return the inputs of a jump whose targets press the legs against narrow stops."""
     values = jump()
     for leg in range(4):
-        first = leg * LEG + int(LOWER)
+        first = leg * LEG + LOWER
         values["table"][first : first + 3] = [-0.6, 0.25, 0.3]  # [rad] lateral, outer, inner
     return values
 
@@ -79,7 +67,7 @@ def sprung() -> dict[str, np.ndarray]:
     """Return the inputs of a jump with four different springs between the knees."""
     values = jump()
     for leg in range(4):
-        stiffness = leg * LEG + int(SPRING)
+        stiffness = leg * LEG + SPRING
         values["table"][stiffness : stiffness + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]  # [N/m], length [m]
     return values
 
@@ -92,7 +80,7 @@ CASES = {  # inputs, name of the input, its entries, step of the differences in 
     "wrench": (jump, "wrench", [(0, 2), (6, 0), (6, 5), (30, 1)], 1.0e-4),
     "masses": (jump, "table", MASSES, 1.0e-6),
     "joints": (jump, "table", JOINTS, 1.0e-6),
-    "gravity": (jump, "table", [int(GRAVITY), int(GRAVITY) + 2], 1.0e-5),
+    "gravity": (jump, "table", [GRAVITY, GRAVITY + 2], 1.0e-5),
     "latency": (jump, "latency", [()], 1.0e-8),
     "filter": (jump, "filter", [8, 12], 1.0e-6),
     "kp": (jump, "kp", [1, 8], 1.0e-4),
@@ -102,9 +90,9 @@ CASES = {  # inputs, name of the input, its entries, step of the differences in 
     "fade": (jump, "fade", [0, 1], 1.0e-4),
     "friction": (sliding, "table", MU_ROWS, 1.0e-6),
     "sliding": (sliding, "qd", [0, 1, 5], 1.0e-6),
-    "springs": (sprung, "table", [int(SPRING) + LEG, int(SPRING) + 1, int(SPRING) + 1 + 2 * LEG], 1.0e-5),
+    "springs": (sprung, "table", [SPRING + LEG, SPRING + 1, SPRING + 1 + 2 * LEG], 1.0e-5),
     "sprung": (sprung, "targets", [(0, 1), (3, 0), (4, 4), (8, 7)], 2.0e-6),
-    "stops": (folding, "table", [int(LOWER) + 1, int(STOP_KE), int(STOP_KD) + LEG], 1.0e-6),
+    "stops": (folding, "table", [LOWER + 1, STOP_KE, STOP_KD + LEG], 1.0e-6),
     "pressed": (folding, "targets", [(4, 4), (8, 7)], 1.0e-6),
 }
 
@@ -171,7 +159,7 @@ def test_gradients_of_a_hung_robot_match_differences():
 def test_gradients_by_bodies_match_differences_of_their_moments():
     """Gradients by mass, com and inertia about the com of a shank follow from moments by the parallel axis theorem."""
     rng = np.random.default_rng(2)
-    gradient = rng.normal(size=(int(GRAVITY) + 3, 1))
+    gradient = rng.normal(size=(GRAVITY + 3, 1))
     table = rollout().parameters["table"].numpy()[:, :1].astype(float)
     body = 5  # inner shank of FL
 

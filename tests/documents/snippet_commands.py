@@ -108,10 +108,6 @@ class Commands:
             self.check_script(words[scripts[0]], words[scripts[0] + 1 :])
         elif name == "make":
             self.made["outputs"] = None
-        elif name in VIEWERS:
-            for word in words:
-                if "/" in word or Path(word).suffix:
-                    self.require(Path(word))
 
     def check_jumper(self, args):
         """Parse `jumper ARGS`. Raises CommandError."""
@@ -210,16 +206,12 @@ class Commands:
         self.check(words)
         train = ["train"] == words[1:2]
         words = [*words, *train_flags] if name == "jumper" and train else words
-        if name in VIEWERS:
-            for word in words[1:]:
-                if ("/" in word or Path(word).suffix) and not Path(word).exists():
-                    raise CommandError(f"{word}: no such file")
-        elif name == "jumper":
+        if name == "jumper":
             run_here(lambda: main(words[1:]))
         elif name in ("python", "python3") and words[1:] and words[1].endswith(".py"):
             with patch.object(sys, "argv", words[1:]):
                 run_here(lambda: runpy.run_path(words[1], run_name="__main__"))
-        else:
+        elif name not in VIEWERS:
             paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
             done = subprocess.run(words, env=os.environ | paths, capture_output=True, text=True, check=False)
             if done.returncode:

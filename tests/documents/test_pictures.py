@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-import pytest
-
 from docs import paper_curves, policy_pictures
 from jumper_warp.utils.assets import POLICIES
-from jumper_warp.utils.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 
@@ -22,8 +19,3 @@ def test_pages_link_every_picture_of_a_policy():
     pictures = [path for path in POLICIES.glob("*/*.webp") if path.name != "picture.webp"]
     assert [path for path in pictures if f"{path.parent.name}/{path.name}" not in text] == []
     assert [name for name in policy_pictures.PICTURES if not (POLICIES / f"{name}.webp").is_file()] == []
-
-
-def test_refuses_the_name_of_an_unknown_picture():
-    with pytest.raises(InputError, match="no picture 'vertical_jump/film'"):
-        policy_pictures.main(["vertical_jump/film"])

@@ -16,7 +16,6 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.tasks.terms import TerminationTerm
 
 
 def test_integers_of_numpy_and_torch_are_counts():
@@ -31,11 +30,6 @@ def test_integers_of_numpy_and_torch_are_counts():
     assert envs.reset()[0].shape[0] == 2
     Simulation(np.int64(2), substeps=np.int64(4), visuals=False, device="cpu").step()
     assert type(TrainCfg("vertical-jump", num_envs=np.int64(8)).num_envs) is int
-
-
-def test_a_bool_of_numpy_is_a_flag():
-    assert Env(hold_height(), 2, device="cpu", randomize=np.bool_(False)).config()["randomize"] is False
-    assert TerminationTerm(hold_height().terminations[0].func, success=np.bool_(True)).options["success"] is True
 
 
 def test_what_holds_arrays_of_a_device_can_be_neither_copied_nor_pickled():

@@ -6,20 +6,19 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from columns import MOTOR_COORDS, MOTOR_DOFS, Z
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.attitude import TURN_METRICS, AttitudeLog, axis_metrics, axis_turns
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.attitude.cfg import AttitudeResetCfg, TurnCfg
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.metrics import measure
 from momentum_oracle import momentum, rotational_inertia
 from pinocchio_model import build_pinocchio
+from velocity_helpers import edit
 
 N = 64
 DEG = np.pi / 180.0
@@ -74,13 +73,11 @@ def test_the_remaining_rotation_is_observed(env):
 
 def test_an_episode_succeeds_within_tolerance_and_without_collision(env):
     env.reset()
-    records = env.skills[0].states.numpy().copy()
-    records["goal"] = env.task_arrays()["base_quat"]
-    aside = Rotation.from_euler("x", 30, degrees=True)
-    records["goal"][1] = (Rotation.from_quat(records["goal"][1]) * aside).as_quat()
-    records["collisions"][2] = 1
+    goal, aside = env.task_arrays()["base_quat"].copy(), Rotation.from_euler("x", 30, degrees=True)
+    goal[1] = (Rotation.from_quat(goal[1]) * aside).as_quat()
     env.metrics()
-    env.skills[0].states.assign(wp.array(records, dtype=AttitudeState, device="cpu"))
+    edit(env, goal=goal)
+    edit(env, 2, collisions=1)
     hold = (env.sim.joint_q()[:, MOTOR_COORDS] - env.robot.default_angle.numpy()) / (90.0 * DEG)
     action = torch.tensor(hold, dtype=torch.float32)
     for _ in range(30):

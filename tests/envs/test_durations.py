@@ -72,18 +72,12 @@ def test_a_time_limit_of_infinite_steps_ends_no_episode(steps):
 
 @pytest.mark.parametrize("steps", [-1.0, math.nan, -math.inf])
 def test_refuses_negative_and_undefined_durations(steps):
-    with pytest.raises(InputError, match="steps"):
-        TerminationTerm(terminations.landed_for, steps=steps)
     with pytest.raises(InputError, match="idle_steps"):
         TerminationTerm(terminations.no_jump, steps=3.0, idle_steps=steps)
     with pytest.raises(InputError, match="interval_range_s"):
         EventTerm(mdp.events.joint_offset, mode="interval", interval_range_s=(1.0, steps), lower=0.0, upper=0.0)
-    env = make_env(N)
-    with pytest.raises(InputError, match="steps"):
-        env.set("terminations.too_long.steps", steps)
-    level = make_task("velocity-flat").levels[0]
     with pytest.raises(InputError, match="resampling_time_range"):
-        dataclasses.replace(level, resampling_time_range=(1.0, steps))
+        dataclasses.replace(make_task("velocity-flat").levels[0], resampling_time_range=(1.0, steps))
 
 
 def test_an_infinite_time_limit_is_saved_and_is_no_time_limit_of_the_metrics():

@@ -17,6 +17,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.utils.dumps import load_dump, write_dump
 from jumper_warp.utils.errors import InputError
+from velocity_helpers import edit
 
 N = 48
 LIMIT = 1.0  # [m] The faulty terms are not finite above this height of the base
@@ -119,10 +120,8 @@ def test_a_reward_of_weight_0_is_not_evaluated():
 
 def test_a_metric_of_the_state_counts_a_value_that_is_not_finite_as_0():
     env = make_env(N, task=make_task("attitude"))
-    states = env.skills[0].states.numpy().copy()
-    states["sum_error"], states["episodes"] = 0.25, 1.0
-    states["sum_error"][3] = math.nan
-    env.skills[0].states.assign(states)
+    edit(env, sum_error=0.25, episodes=1.0)
+    edit(env, 3, sum_error=math.nan)
     assert env.metrics()["Metrics/error_at_end_rad"] == pytest.approx(0.25 * (N - 1) / N)
 
 

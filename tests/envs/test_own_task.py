@@ -1,22 +1,18 @@
 """User-defined task `hold_height`: training, its state and terms, and loading its saved configuration with its file."""
 
 import importlib.util
-import json
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 import hold_height
 from columns import Z
-from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.torch.ppo import Ppo
-from jumper_warp.tasks.saving import task_from_json, task_to_json
+from velocity_helpers import edit
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/helpers/hold_height.py"
@@ -34,14 +30,6 @@ def make_env(num_envs=N, task=None, **arguments) -> Env:
 def states_of(env) -> np.ndarray:
     """Return a copy of the task states of all worlds, a structured array."""
     return env.skills[0].states.numpy().copy()
-
-
-def edit(env, worlds=slice(None), **fields) -> None:
-    """Overwrite fields of the states of worlds."""
-    records = states_of(env)
-    for name, value in fields.items():
-        records[name][worlds] = value
-    env.skills[0].states.assign(records)
 
 
 # ---------------------------------------------------------------- training and terms
@@ -157,76 +145,3 @@ def test_user_defined_event_is_sampled_at_every_reset_of_a_world():
     others = np.arange(N) != 3
     assert (torques[1:, :, others] == torques[:-1, :, others]).all() and (torques[1:, :, 3] != torques[:-1, :, 3]).all()
     assert (make_env(task=task, randomize=False).sim.motors.saturation.numpy() == nominal.astype(np.float32)).all()
-
-
-# ---------------------------------------------------------------- saving and loading
-
-FRESH = """
-import importlib.util, json, sys
-import numpy as np
-import torch
-
-sys.modules["hold_height"] = module = importlib.util.module_from_spec(
-    importlib.util.spec_from_file_location("hold_height", sys.argv[1])
-)
-module.__spec__.loader.exec_module(module)
-
-from jumper_warp import registry
-from jumper_warp.envs.env import Env
-from jumper_warp.tasks.saving import task_from_json
-
-with open(sys.argv[2]) as file:
-    task = task_from_json(json.load(file), [module])
-env = Env(task, 8, seed=1, device="cpu")
-env.reset()
-rewards = []
-for action in torch.from_numpy(np.load(sys.argv[3])):
-    env.step(action)
-    rewards.append(env.reward.numpy().copy())
-np.save(sys.argv[4], rewards)
-"""
-"""Code of a process that loads the task from its file and its saved configuration, and saves the rewards of a run."""
-
-
-def python(code: str, *arguments: Path, path: Path | None = None) -> str:
-    """Run code in a new process and return its output; path: additional folder of modules."""
-    paths = [str(ROOT), *([str(path)] if path else [])]
-    environment = {"PYTHONPATH": ":".join(paths), "PATH": "", "HOME": str(Path.home())}
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "assets", env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-@pytest.fixture
-def saved(tmp_path) -> Path:
-    """Return a JSON file of the task with a changed reward term."""
-    task = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
-    path = tmp_path / "task.json"
-    path.write_text(json.dumps(task_to_json(task)))
-    return path
-
-
-def test_a_task_loaded_in_a_new_process_gives_the_same_rewards(saved, tmp_path):
-    actions = 0.5 * (2.0 * torch.rand((150, N, 12), generator=torch.Generator().manual_seed(0)) - 1.0)
-    np.save(tmp_path / "actions.npy", actions.numpy())
-    python(FRESH, FILE, saved, tmp_path / "actions.npy", tmp_path / "rewards.npy")
-    env, ended = make_env(task=task_from_json(json.loads(saved.read_text()), [hold_height])), 0.0
-    for action, expected in zip(actions, np.load(tmp_path / "rewards.npy"), strict=True):
-        env.step(action)
-        ended += env.done.sum()
-        np.testing.assert_array_equal(env.reward, expected)
-    assert ended >= N and len(np.unique(expected)) == N
-
-
-def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch, request):
-    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
-    request.addfinalizer(lambda: sys.modules.pop("level_jump"))
-    registry.load_task_module(str(ROOT / "tests/helpers/level_jump.py"))
-    task = registry.make_task("level-jump")
-    env = Env(task, 4, randomize=False, noise=False, device="cpu")
-    env.evaluation_reset([0.0, 0.0, 0.9])
-    env.step(torch.zeros(4, 12))
-    row = [term.name for term in task.rewards].index("level")
-    # e^0 = 1 of weight 2 over a step of 1/60 s
-    assert env.skills[0].term_value.numpy()[row] == pytest.approx(np.full(4, 2.0 / 60.0), rel=0.05)

@@ -9,7 +9,7 @@ import pytest
 from columns import MOTOR_DOFS
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.tasks.randomization import RandomizationCfg
-from randomization_helpers import ALL, BEYOND, HELD, OFF, PAPER, ROWS, WALKING, fills, own_model, randomized, read
+from randomization_helpers import ALL, HELD, OFF, PAPER, ROWS, fills, own_model, randomized, read
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +22,6 @@ def nominal():
 def drawn():
     """Return the parameters of 512 worlds with every row on."""
     return read(randomized(RandomizationCfg(observation_latency=(0.0, 16.0), **HELD), 512))
-
-
-def test_ranges_equal_those_of_the_paper():
-    assert vars(RandomizationCfg()) == PAPER | BEYOND
-    walking = vars(RandomizationCfg.walking())
-    assert {name: walking[name] for name in WALKING} == WALKING
-    assert set(walking) == {*PAPER, *BEYOND}
 
 
 def test_parameters_without_randomisation_are_those_of_the_description(nominal):
@@ -109,13 +102,6 @@ def test_every_other_row_has_its_own_event(row):
     assert [event.func for event in rest] == [event.func for event in every.events() if event.func is not alone.func]
 
 
-def test_parameters_are_equal_for_equal_seeds_only():
-    one, same, other = (read(randomized(RandomizationCfg(**ALL, **HELD), 8, seed=seed)) for seed in (3, 3, 4))
-    for name in one:
-        np.testing.assert_array_equal(one[name], same[name], err_msg=name)
-        assert not np.array_equal(one[name], other[name]), name
-
-
 # ---------------------------------------------------------------- MuJoCo
 
 
@@ -141,6 +127,3 @@ def test_randomised_parameters_reach_mujoco():
         assert solver is env.sim.solver.mjw_model
         env.reset()
         assert all((found[name] != values).any() for name, values in own_model(env).items())
-
-
-# ---------------------------------------------------------------- the configuration

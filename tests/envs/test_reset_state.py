@@ -1,17 +1,19 @@
-"""State after a reset: it does not depend on earlier episodes, and motors at rest have no torque."""
+"""State after a reset: independent of earlier episodes and of threads per world; motors at rest have no torque."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from ground_helpers import hardest
 from jump_helpers import make_env, only, random_actions, resetting
 from jumper_warp.envs.env import Env
+from jumper_warp.kernels.mdp.attempts import LANES
 from jumper_warp.registry import TASKS, make_task
 
-N = 4
+N, LANE_WORLDS = 4, 96
 
 
 def differences(a: Env, b: Env) -> list[str]:
@@ -44,11 +46,6 @@ def test_a_used_environment_has_the_state_of_a_new_one_after_a_reset(name, solve
     assert not differences(used, new)
 
 
-def test_no_termination_is_reported_before_the_first_step():
-    env = make_env(N)
-    assert (env.task_arrays()["termination"] == -1).all()
-
-
 def test_the_push_of_an_earlier_episode_is_not_observed_after_a_reset():
     env = make_env(N, task=pushed(make_task("velocity-flat")), randomize=True)
     env.step(torch.zeros(N, 12))
@@ -74,3 +71,29 @@ def test_motors_hold_the_present_angles_until_the_first_action_arrives():
     np.testing.assert_allclose(held, np.broadcast_to(angles.T, held.shape), atol=1e-6)
     env.sim.advance(1, env.delays.current_target)
     assert np.abs(env.robot.torque.numpy()).max() < 1e-3
+
+
+def reset_by(env, lanes):
+    """Return coordinates, rates and states of the worlds after a reset with `lanes` threads per world."""
+    skill = env.skills[0]
+    env.sim.state.joint_q.assign(np.tile(env.sim.model.joint_q.numpy()[:43], LANE_WORLDS))
+    skill.states.zero_()
+    inputs = [skill.index, lanes, env._all, env._scene, env._settings, skill.settings, skill.levels, env.episodes,
+              skill.states, env.robot]  # fmt: skip
+    wp.launch(skill.kernels["reset"], (LANE_WORLDS, lanes), inputs, device="cpu", block_dim=max(lanes, 1))
+    return env.sim.joint_q(), env.sim.joint_qd(), skill.states.numpy().copy()
+
+
+@pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump", "attitude"])
+def test_several_threads_per_world_sample_the_same_starts_as_one(name, monkeypatch):
+    env = Env(hardest(make_task(name)), LANE_WORLDS, seed=3, device="cpu", randomize=False, noise=False)
+    env.reset()
+    alone = reset_by(env, 1)
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    shared = reset_by(env, LANES)
+    for found, expected in zip(shared[:2], alone[:2], strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for field in shared[2].dtype.names:
+        np.testing.assert_array_equal(shared[2][field], alone[2][field], err_msg=field)
+    default = env.sim.model.joint_q.numpy()[7:43]
+    assert (alone[0][:, 7:] != default).any(axis=1).sum() > LANE_WORLDS // 2  # sampled, not the default pose

@@ -17,6 +17,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from skill_helpers import begin_hold, begin_jump, hold_requested, jump_requested
+from velocity_helpers import edit
 
 N = 16
 DEG = np.pi / 180.0
@@ -238,9 +239,7 @@ def test_a_new_skill_observes_nothing_from_before_the_handover():
 def test_a_world_switches_at_most_once_a_step_and_not_when_its_episode_ends():
     handovers = (Handover(HOLD, AGAIN, always, keep_holding), Handover(AGAIN, HOLD, always, keep_holding))
     env = make(HOLD, AGAIN, handovers=handovers)
-    records = env.skills[0].states.numpy().copy()
-    records["steps"][2] = 119  # the episode ends in this step, and the next one has the same skill
-    env.skills[0].states.assign(records)
+    edit(env, 2, steps=119)  # the episode ends in this step, and the next one has the same skill
     skills = followed(env, torch.zeros((5, N, 12)))[1]
     rest = np.arange(N) != 2
     assert (skills[:, rest] == np.array([1, 0, 1, 0, 1])[:, None]).all()
@@ -258,16 +257,6 @@ def test_an_environment_with_handovers_continues_bitwise_from_a_saved_state():
     assert torch.equal(fresh.reward, saved.reward) and (saved.episodes.skill.numpy() == 1).all()
 
 
-def test_reset_with_a_seed_restores_first_skills_and_their_motors():
-    env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP,), randomize=False) for _ in range(2))
-    followed(env, torch.zeros((3, N, 12)), request_at=1)
-    assert set(env.episodes.skill.numpy()) == {0, 1}
-    env.reset(seed=5)
-    assert (env.episodes.skill.numpy() == 1).all()
-    for name, values in parameters_of(fresh).items():
-        np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
-
-
 def test_a_command_in_the_request_is_given_at_the_handover():
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False, noise=False)
     followed(env, torch.zeros((3, N, 12)))
@@ -282,26 +271,22 @@ def test_a_command_in_the_request_is_given_at_the_handover():
     first, _ = JUMP.layout("actor")["wanted_height"]
     np.testing.assert_allclose(env.skills[0].obs["actor"][CHOSEN, first], commands[CHOSEN, 2], rtol=1e-6)
     assert not env.episodes.has_command.numpy()[CHOSEN].any() and (env.episodes.skill.numpy()[8:] == 1).all()
-    with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
-        env.request(0, CHOSEN, np.zeros((3, 2)))
 
 
-@pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
+@pytest.mark.parametrize("begin", ["reset", "reset with a seed", "evaluation_reset", "ended"])
 def test_new_episodes_begin_in_the_first_skill_without_requests(begin):
     """In the case "ended" one episode ends by its termination; other worlds do not change."""
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
     env.request(1, np.arange(N) == 4, np.ones((N, 1)))
     new = np.full(N, True)
-    if begin == "reset":
-        env.reset()
+    if begin.startswith("reset"):
+        env.reset(seed=5 if "seed" in begin else None)
     elif begin == "evaluation_reset":
         env.evaluation_reset(np.full((N, 1), 0.3))
     else:
         new = np.arange(N) == 3
-        records = env.skills[0].states.numpy().copy()
-        records["steps"][3] = 10_000  # too long
-        env.skills[0].states.assign(records)
+        edit(env, 3, steps=10_000)  # too long
         env.request(1, new)
         followed(env, torch.zeros((1, N, 12)))
         assert env.done[3]
@@ -315,21 +300,11 @@ def test_new_episodes_begin_in_the_first_skill_without_requests(begin):
 def test_metrics_and_configuration_contain_all_skills():
     env = make(JUMP, HOLD, skill=SKILL.astype(int), handovers=(TO_JUMP, TO_HOLD))
     followed(env, 0.5 * random_actions(N, 130))
-    ended = {
-        name: sum(v for k, v in env.skills[i].metrics().items() if "Termination" in k) for i, name in enumerate("ab")
-    }
-    assert min(ended.values()) > 0.9
-    followed(env, 0.5 * random_actions(N, 130))
-    metrics = env.metrics()
+    metrics, config = env.metrics(), env.config()
     assert "Episode_Reward/jump_height" in metrics and "hold-height/Episode_Reward/near_goal" in metrics
     assert sum(v for k, v in metrics.items() if k.startswith("hold-height/Episode_Termination")) == pytest.approx(1.0)
-    config = env.config()
-    assert [task["name"] for task in config["tasks"]] == ["vertical-jump", "hold-height"]
     assert config["first_skill"] == SKILL.astype(int).tolist()
     assert config["handovers"][0]["when"].endswith(":jump_requested")
-
-
-# ---------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(
@@ -337,15 +312,10 @@ def test_metrics_and_configuration_contain_all_skills():
     [
         (lambda: Env([HOLD, HOLD], N), "unique names, got .*'hold-height', 'hold-height'"),
         (lambda: Env([JUMP, HOLD], N, skill=2), "skill must be an index below 2, got 2 to 2"),
-        (
-            lambda: Env([JUMP, HOLD], N, skill=np.zeros(N + 1, dtype=int)),
-            r"skill must be .* 16 ints, got int64 of shape \(17,\)",
-        ),
         (lambda: Env([JUMP, make_task("horizontal-jump")], N, handovers=[TO_JUMP]), "hold-height to vertical-jump"),
         (lambda: make(JUMP, HOLD).step(torch.zeros((N, 12))), r"shape \(2, 16, 12\), got \(16, 12\)"),
     ],
 )
 def test_refuses_invalid_skills(make_env, message):
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=message):
         make_env()
-    assert "\n" not in str(caught.value)

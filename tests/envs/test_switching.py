@@ -119,42 +119,22 @@ def test_jumps_are_commanded_squat_time_after_the_handover_and_walking_starts_st
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)
 
 
-# ---------------------------------------------------------------- robot overlays
-
-
-@pytest.fixture
-def trained_with():
-    """Return a function that loads the policies of the three skills as if trained with overlays of base masses [kg]."""
-
-    def load(*masses):
-        policies = SkillRun()
-        robots = [None if mass is None else RobotOverlay({"base_mass": (mass,)}, source="bench") for mass in masses]
-        policies.recipes = [
-            replace(recipe, robot=robot) for recipe, robot in zip(policies.recipes, robots, strict=True)
-        ]
-        return policies
-
-    return load
-
-
-def mass_of(policies, **conditions):
-    """Return the base mass [kg] of the robot of three skills."""
+def mass_of(*trained, **conditions):
+    """Return the base mass [kg] of the robot of three skills, trained with overlays of base masses [kg] or without."""
+    policies = SkillRun()
+    robots = [None if mass is None else RobotOverlay({"base_mass": (mass,)}, source="bench") for mass in trained]
+    policies.recipes = [replace(recipe, robot=robot) for recipe, robot in zip(policies.recipes, robots, strict=True)]
     policies.conditions = Conditions(device="cpu", **conditions)
-    env = policies.env(1)
-    return pytest.approx(float(env.sim.model.body_mass.numpy()[0]))
+    return float(policies.env(1).sim.model.body_mass.numpy()[0])
 
 
-def test_skills_have_the_robot_of_their_training(trained_with, capfd):
-    assert mass_of(trained_with(8.0, 8.0, 8.0)) == 8.0
+def test_skills_have_the_robot_of_their_training_unless_it_differs(tmp_path, capfd):
+    assert mass_of(8.0, 8.0, 8.0) == pytest.approx(8.0)
     assert "overlay" not in capfd.readouterr().err
-    assert mass_of(trained_with(None, 8.0, None)) == 8.0
+    assert mass_of(None, 8.0, None) == pytest.approx(8.0)
     line = "jumper: the robot has the overlay of vertical_jump; walking_flat and horizontal_jump were trained without"
     assert line in capfd.readouterr().err.splitlines()
-
-
-def test_skills_of_different_robots_need_a_choice(trained_with, tmp_path):
-    policies = trained_with(8.0, None, 7.0)
     with pytest.raises(PolicyError, match=r"walking_flat and horizontal_jump .* different robots.* --robot FILE"):
-        policies.env(1)
+        mass_of(8.0, None, 7.0)
     RobotOverlay({"base_mass": (9.0,)}).save(tmp_path / "robot.json")
-    assert mass_of(policies, robot=tmp_path / "robot.json") == 9.0
+    assert mass_of(8.0, None, 7.0, robot=tmp_path / "robot.json") == pytest.approx(9.0)

@@ -3,7 +3,6 @@
 import dataclasses
 import threading
 import time
-from functools import partial
 
 import numpy as np
 import pytest
@@ -169,13 +168,6 @@ def test_slices_contain_each_world_once_and_are_about_equal(worlds, threads):
 
 
 # ---------------------------------------------------------------- threads
-
-
-def test_each_job_runs_once_whatever_the_number_of_threads():
-    for threads in (1, 2, 5):
-        done: list[int] = []
-        pool.run_in_parallel([partial(done.append, i) for i in range(7)], threads)
-        assert sorted(done) == list(range(7))
 
 
 @pytest.mark.parametrize("failing", [0, 1])

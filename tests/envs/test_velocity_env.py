@@ -163,18 +163,6 @@ def test_a_new_command_is_sampled_when_the_old_one_ends(flat):
     np.testing.assert_array_equal(flat.obs[:, :3].numpy(), state["command"])
 
 
-def test_a_command_of_the_caller_does_not_change(flat):
-    flat.evaluation_reset(np.tile([0.3, 0.1, 0.2], (8, 1)))
-    state = states_of(flat)
-    np.testing.assert_allclose(state["command"], np.tile([0.3, 0.1, 0.2], (8, 1)), rtol=1e-6)
-    assert not state["command_lasts"].any() and not state["episode_steps"].any() and not state["pace"].any()
-    flat.command(np.tile([0.01, 0.0, -0.04, 3.0], (8, 1)), np.arange(8) < 4)
-    state = states_of(flat)
-    np.testing.assert_allclose(state["pace"], np.where(np.arange(8) < 4, 0.05, 0.0), rtol=1e-6)
-    np.testing.assert_array_equal(state["standing"], (np.arange(8) < 4).astype(int))
-    assert not state["command"][:4].any() and state["command"][4:].all()
-
-
 def test_steps_are_bitwise_reproducible_with_a_seed(rough):
     def play():
         rough.reset(seed=9)

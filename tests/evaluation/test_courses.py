@@ -120,10 +120,8 @@ def test_course_metrics_match_hand_computed_values():
 
 def test_landing_error_is_distance_from_goal_and_beyond_tolerance_off_goal():
     course, _ = run_course((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
-    assert (
-        values(course_metrics(course))["goal_distance_at_handover_mean_m"] == pytest.approx(0.05)
-        and course.switch_step[0, 0] > 0
-    )
+    assert course.switch_step[0, 0] > 0
+    assert values(course_metrics(course))["goal_distance_at_handover_mean_m"] == pytest.approx(0.05)
     course.offset[0, 0] = 0.2
     assert values(course_metrics(course))["finished_on_goal_rate"] == 0.0
     assert values(course_metrics(course))["finished_rate"] == 1.0
@@ -152,32 +150,6 @@ def test_fall_ends_course_and_its_samples():
 
 def test_robot_that_never_stops_has_outcome_stuck():
     course, env = run_course(never_stops=True)
-    assert (
-        course.outcomes.tolist() == ["stuck", "stuck"] and values(course_metrics(course))["ended_by_stuck_rate"] == 1.0
-    )
-    assert (
-        env.steps == 120 + round(JUMP_TIMEOUT / DT)
-        and values(course_metrics(course))["command_to_takeoff_mean_s"] is None
-    )
-
-
-def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
-    course, env = CourseLog([(SCRIPT[0], ScriptStep("jump_to", (0.5, 0.1)))]), ScriptedEnv(1)
-    course.begin(env)
-    for number in range(200):
-        goal = np.full((1, 3), 0.01 * number)
-        course.read_env = lambda env, goal=goal: env.step() | {"jump_goal": goal}
-        course.record_step(env)
-    before = course.switch_step[0, 1] - 1
-    expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
-    np.testing.assert_allclose(course.marks()["goals"][0], expected)
-
-
-def test_series_and_columns_report_robot_state():
-    course, _ = run_course()
-    series = course.named(course.series(), [1])
-    assert series["vx/actual, robot 2 [m/s]"] == pytest.approx(0.4)  # command and error of `ScriptedEnv`
-    assert series["vx/command, robot 2 [m/s]"] == pytest.approx(0.3) == course.marks()["commands"][1, 0]
-    assert course.named(course.states(), [1]) == {"skill/robot 2": "walk"}
-    assert course.columns()["commands_done"] == [3, 3]
-    assert SimpleNamespace(**course.notes([0])).scripts[0][1] == ["jump_up", 0.75]
+    metrics = values(course_metrics(course))
+    assert course.outcomes.tolist() == ["stuck", "stuck"] and env.steps == 120 + round(JUMP_TIMEOUT / DT)
+    assert metrics["ended_by_stuck_rate"] == 1.0 and metrics["command_to_takeoff_mean_s"] is None

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, command_columns, command_text, episode_metrics
+from jumper_warp.evaluation.episodes import EpisodeFlags, episode_metrics
 from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import make_task
-from jumper_warp.tasks.cfg import Command
 from jumper_warp.tasks.evaluation import EpisodeEvaluation, EpisodeMetric
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.output import read_values
@@ -158,12 +157,3 @@ def test_metrics_and_goal_are_of_the_state_at_the_end_of_each_episode(marker):
         assert marks["goals"].shape == (4, 1, 3) and marks["goals"][:, 0, 0].tolist() == [1.0, 2.0, 2.0, 2.0]
     else:
         assert marks["heights"].tolist() == [0.4, 0.2, 0.1, 0.1]
-
-
-def test_commands_are_named_by_their_labels_without_slashes():
-    """A slash would end a name in the viewer's tree."""
-    walk, turn = make_task("velocity-flat"), make_task("attitude")
-    assert command_text(walk, np.array([0.5, 0.0, -1.0])) == "forward 0.5 m per s, left 0 m per s, turning -1 rad per s"
-    assert command_text(turn, np.array([1.0, 0.0, 0.0, 0.0])).startswith("quaternion x 1, quaternion y 0, ")
-    assert command_text(replace(walk, command=Command(walk.command.set)), np.array([0.5, 1.0])) == "command 0.5 1"
-    assert command_columns(walk)[::2] == ["command_forward_m_s", "command_turning_rad_s"]

@@ -141,10 +141,8 @@ def test_finetuning_and_evaluation_share_no_robot_and_no_delay(seed):
     for env in (tuned, reported):
         env.evaluation_reset(np.tile([0.0, 0.0, 0.8], (16, 1)))
     masses = [env.parameters.body_mass.numpy().reshape(16, 1, -1) for env in (tuned, reported)]
-    for drawn in (
-        masses,
-        [env.parameters.gain_ratio.numpy().swapaxes(0, 1).reshape(16, 1, -1) for env in (tuned, reported)],
-    ):
+    gains = [env.parameters.gain_ratio.numpy().swapaxes(0, 1).reshape(16, 1, -1) for env in (tuned, reported)]
+    for drawn in (masses, gains):
         random = np.ptp(drawn[0], axis=0)[0] > 0.0
         assert random.sum() > 10
         assert not (drawn[0] == drawn[1].swapaxes(0, 1))[..., random].any()

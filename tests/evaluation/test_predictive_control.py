@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
@@ -7,7 +6,6 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.predictive_control import PredictiveController
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
-from jumper_warp.utils.errors import InputError
 
 WEAK = RobotOverlay({"saturation": (1.0, 1.0, 0.5, *(9 * (1.0,)))})  # Half the torque of the left front inner motor
 
@@ -48,10 +46,3 @@ def test_state_of_the_robot_is_not_changed_and_assumed_parameters_stay():
     assert all((before[name] == after[name]).all() for name in before)
     assert assumed.snapshot().parameters["saturation"][2, 0] == 18.0
     assert env.snapshot().parameters["saturation"][2, 0] == 9.0
-
-
-def test_policies_that_do_not_jump_are_rejected():
-    policy = Policy.load("walking_flat")
-    env = robots(policy)
-    with pytest.raises(InputError, match="needs a jump"):
-        PredictiveController(env, policy, env)

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 
 from hold_height import hold_height
-from jump_helpers import make_env, random_actions
+from jump_helpers import random_actions
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.episodes import EpisodeLog
-from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.motion import set_motion
 from jumper_warp.evaluation.recorder import EnvRecorder, ankles
 from jumper_warp.registry import make_task
 from jumper_warp.robot.grounds import platform
 from jumper_warp.robot.model import build_model
 from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
-from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.recording import Recording, load_npz
 from jumper_warp.viz.shapes import shape_meshes
+from recordings import record_jumps
 
 
 def recording(frames=3, worlds=2, spacing=2.0):
@@ -44,16 +45,8 @@ def test_ankle_positions_follow_shank_poses():
 
 
 def test_paw_forces_are_peaks_between_the_frames():
-    env, log = make_env(1), JumpLog(np.array([0.9]), make_task("vertical-jump").termination_names)
-    recorder = EnvRecorder(env, log, [0])
-    actions = iter(random_actions(1, 30))
     sampled_last = []
-
-    def on_step():
-        recorder()
-        sampled_last.append(env.sim.paw_force.numpy()[:, 0].T.copy())  # (3, 4)
-
-    run_evaluation(lambda obs: next(actions), env, log, seconds=0.5, on_step=on_step, stop=False)
+    recorder = record_jumps([0.9], 30, [0], lambda env: sampled_last.append(env.sim.paw_force.numpy()[:, 0].T.copy()))
     shown = recorder.recording()
     sampled = np.linalg.norm(shown.contact_forces[:, 0], axis=2)
     peaks = np.stack([shown.series[f"peak paw force/{leg} [N]"] for leg in ("FL", "FR", "BL", "BR")], axis=1)
@@ -94,11 +87,26 @@ def test_series_are_those_of_the_environment():
     np.testing.assert_allclose(command, 0.35)
 
 
+def test_rewards_of_a_recorded_motion_are_those_of_the_simulation(tmp_path):
+    """The recording of the second of three worlds, read from its file."""
+    rewards = []
+
+    def on_step(env):
+        rewards.append({name: float(values[1]) for name, values in env.reward_terms.items()})
+
+    recorder = record_jumps([0.9] * 3, 60, [1], on_step)
+    recording = load_npz(recorder.recording().save_npz(tmp_path / "jump.npz"))
+    env = Env(make_task("vertical-jump"), 1, device="cpu", randomize=False, noise=False)
+    episode = env.stages()["episode"]
+    for frame, expected in enumerate(rewards):
+        set_motion(env, recording.motion, frame)
+        episode()
+        assert {name: float(values[0]) for name, values in env.reward_terms.items()} == expected
+    assert sum(value != 0.0 for terms in rewards for value in terms.values()) > 300
+
+
 def test_a_recording_may_begin_at_any_frame():
-    env, log = make_env(1), JumpLog(np.array([0.9]), make_task("vertical-jump").termination_names)
-    recorder = EnvRecorder(env, log, [0])
-    actions = iter(random_actions(1, 6))
-    run_evaluation(lambda obs: next(actions), env, log, seconds=0.1, on_step=recorder, stop=False)
+    recorder = record_jumps([0.9], 6, [0])
     whole = recorder.recording()
     part = recorder.recorder.recording(first=4)
     assert part.times.tolist() == whole.times[4:].tolist()

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.walking_terrain import walked_fraction
 from jumper_warp.evaluation import velocities
-from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, VelocityPlayFlags
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog
 from jumper_warp.registry import make_task
 from jumper_warp.utils.metrics import measure
 from metric_helpers import values
@@ -117,17 +117,3 @@ def test_walked_fraction_stops_at_fall_and_is_at_most_1():
     assert walked_fraction(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # over the last 2 s
     fast = walk_log(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
     assert walked_fraction(fast) == pytest.approx([1.0] * 3)
-
-
-def test_command_grid_stays_in_its_range():
-    commands = velocities.command_grid(3, (0.8, 0.6, 0.4))
-    assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
-
-
-def test_play_flags_command_velocities_in_sequence_and_six_by_default():
-    one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
-    np.testing.assert_array_equal(VelocityPlayFlags(velocity=one).log(TASK).commands, [one])
-    goals = VelocityPlayFlags(velocity=two, command_interval=2.0)
-    assert goals.length == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
-    np.testing.assert_array_equal(goals.log(TASK).commands, [two])
-    assert VelocityPlayFlags().log(TASK).commands.shape == (1, 6, 3)

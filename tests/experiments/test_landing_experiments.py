@@ -8,15 +8,7 @@ from columns import X, Y
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.suites import (
-    Consecutive,
-    Farthest,
-    Grid,
-    Platform,
-    consecutive_metrics,
-    distance_metrics,
-    running_positions,
-)
+from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.policy import save_policy
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS
@@ -107,14 +99,6 @@ def test_row_without_fall_may_miss_goals():
     pairs, row = np.ones((2, 2, 2)), landing_log(np.ones((2, 3, 2)), off, LANDED)
     metrics = values(consecutive_metrics(landing_log(pairs, pairs, LANDED), row))
     assert (metrics["row_all_landed_rate"], metrics["row_all_success_rate"]) == (1.0, 0.5)
-
-
-def test_positions_of_bases_are_those_of_running_rows():
-    landings = JumpLog(np.zeros((2, 1, 2)), TERMINATIONS)
-    landings.arrays = {"base_pos": np.array([[0.0, 1.0, 0.3], [0.0, 1.0, 0.3]])}
-    landings.current[1] = 1
-    positions = running_positions(landings)
-    assert positions[0] == pytest.approx([0.0, 1.0]) and np.isnan(positions[1]).all()
 
 
 def test_vectors_turn_about_z():
@@ -254,9 +238,3 @@ def test_suite_writes_metrics_plot_and_recording(suite, settings, files, policy,
     assert (saved[success], saved["torque_limit_nm"]) == (0.0, 18.0)
     for name in files:
         assert (tmp_path / name).stat().st_size > 1000, name
-
-
-def test_standing_policy_has_error_of_full_distance(policy, tmp_path):
-    saved = DistanceSweep(policy=policy, num_jumps=4, num_recorded=0, randomize=True, out=tmp_path, device="cpu").run()
-    assert saved["goal_distance_at_end_mean_m"] == pytest.approx(0.9, abs=0.05)
-    assert saved["randomize"] and saved["landed_rate"] == 0.0 and saved["trained_range_m"] == [0.2, 2.2]

@@ -14,17 +14,14 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def policies(tmp_path_factory):
-    """Folder with a subfolder per task that holds a policy which stands still."""
-    folder = tmp_path_factory.mktemp("policies")
-    for name in ("velocity-flat", "horizontal-jump"):
-        save_policy(folder / name, still_policy(name))
-    return folder
+def policy(tmp_path_factory):
+    """Folder of a policy that stands still."""
+    return str(save_policy(tmp_path_factory.mktemp("policy") / "still", still_policy("velocity-flat")))
 
 
-def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
+def test_standing_policy_has_zero_success_on_terrains(policy, tmp_path):
     args = walking_terrain.Args(
-        policy=str(policies / "velocity-flat"), num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
+        policy=policy, num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
         device="cpu",
     )  # fmt: skip
     metrics = walking_terrain.main(args)
@@ -33,9 +30,9 @@ def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
     assert (tmp_path / "stairs.rrd").stat().st_size > 10_000 and (tmp_path / "flat.png").stat().st_size > 10_000
 
 
-def test_kicks_change_the_velocity_of_every_base_by_their_size(policies, tmp_path):
+def test_kicks_change_the_velocity_of_every_base_by_their_size(policy, tmp_path):
     args = walking_terrain.Args(
-        policy=str(policies / "velocity-flat"), num_robots=3, terrains=("flat",), kick=0.5, num_recorded=0,
+        policy=policy, num_robots=3, terrains=("flat",), kick=0.5, num_recorded=0,
         out=tmp_path, device="cpu",
     )  # fmt: skip
     run = EvaluationRun.from_args("test", args, VelocityEvaluation)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import math
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from columns import MOTOR_COORDS, Z
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
-from jumper_warp.kernels.jump.state import JumpState
+from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.view import RobotView, vec12
 from jumper_warp.kernels.terrain.ground import Ground
@@ -23,6 +24,7 @@ from jumper_warp.tasks.observations import exact
 from mdp_helpers import DEFAULT_ANGLE, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
+PHASES = (int(STANCE), int(FLIGHT), int(LANDED))
 START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
 OF_WORLD = ("level", "streak")  # Fields of a world that last over episodes
 
@@ -68,6 +70,20 @@ class Table:
         inputs = [wp.array(views, dtype=RobotView, device="cpu"), wp.array(tasks, dtype=self._state, device="cpu")]
         wp.launch(self._kernel, len(views), [*inputs, p], [out], device="cpu")
         return out.numpy()[:, list(self._params).index(name)]
+
+    def check(self, name: str, numbers: dict, rows: list, phases=None) -> None:
+        """Assert the values of one function in a jump; rows: (value, fields of the robot, fields of the episode).
+
+        phases: those in which it pays or holds; each row is repeated in the others, where its value must be 0.
+        """
+        if phases is not None:
+            rows = [(value * (phase in phases), robot, episode | {"phase": phase})
+                    for value, robot, episode in rows for phase in PHASES]  # fmt: skip
+        views = [make_view(**robot) for _, robot, _ in rows]
+        values = self.all(name, views, [make_episode(**episode) for _, _, episode in rows], **numbers)
+        expected = [float(row[0]) for row in rows]
+        for row, value, wanted in zip(rows, values.tolist(), expected, strict=True):
+            assert math.isclose(value, wanted, rel_tol=1e-4, abs_tol=1e-6), f"{name}: got {value}, expected {row}"
 
 
 def functions(module, names: str) -> list[wp.Function]:

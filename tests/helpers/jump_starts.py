@@ -3,7 +3,6 @@
 from functools import cached_property
 
 import numpy as np
-import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
@@ -11,11 +10,10 @@ from collision_kernels import make_collision_kernel
 from columns import LIN_VEL, POS
 from jump_helpers import START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
-from solver_helpers import Reference, States, paw_joint
+from solver_helpers import Reference, States
 
 PLACES = ("horizontal-jump", "horizontal-jump-standing")  # Names of the tasks of jumps to landing positions
 PAW_RADIUS = 0.025  # [m]
-ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of a paw's centre in the frame of the joint that carries it
 
 
 class Starts:
@@ -66,30 +64,21 @@ class Starts:
 
 def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return the paw positions [m] by Pinocchio, (worlds, 4, 3), of rows of joint_q and joint_qd."""
-    reference, states = Reference(model), States.read(q, qd)
-    robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
-    paws = np.zeros((len(states.pos), 4, 3))
-    for i in range(len(paws)):
-        pin.forwardKinematics(
-            robot.model, robot.data, robot.configuration(states.pos[i], states.quat[i], states.angles[i])
-        )
-        paws[i] = [robot.data.oMi[joint].act(ANKLE) for joint in joints]
-    return paws
+    return paws_and_velocities_of(model, q, qd)[0]
 
 
 def paws_and_velocities(env: Env, worlds: np.ndarray) -> np.ndarray:
     """Return positions [m] and velocities [m/s] of the paws of some worlds by Pinocchio, (2, worlds, 4, 3)."""
-    reference = Reference(env.sim.model)
-    states = States.read(env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
-    robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
-    paws = np.zeros((2, len(worlds), 4, 3))
-    for i in range(len(worlds)):
-        q, v = reference.state(states, i)
-        pin.forwardKinematics(robot.model, robot.data, q, v)
-        for leg, joint in enumerate(joints):
-            twist = robot.data.v[joint]
-            paws[0, i, leg] = robot.data.oMi[joint].act(ANKLE)
-            paws[1, i, leg] = robot.data.oMi[joint].rotation @ (twist.linear + np.cross(twist.angular, ANKLE))
+    return paws_and_velocities_of(env.sim.model, env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
+
+
+def paws_and_velocities_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return positions [m] and velocities [m/s] of the paws by Pinocchio, (2, worlds, 4, 3)."""
+    reference, states = Reference(model), States.read(q, qd)
+    paws = np.zeros((2, len(q), 4, 3))
+    for i in range(len(q)):
+        configuration, v = reference.state(states, i)
+        paws[:, i] = reference.robot.paw_positions(configuration), reference.robot.paw_velocities(configuration, v)
     return paws
 
 

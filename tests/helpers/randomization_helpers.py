@@ -26,17 +26,6 @@ PAPER = {
     "push_force": (-5.0, 5.0), "push_torque": (-3.0, 3.0),
 }  # fmt: skip
 """Table V, jumping."""
-WALKING = PAPER | {
-    "static_friction": (0.8, 0.95), "dynamic_friction": (0.7, 0.8), "no_load_speed": (0.6, 1.2),
-    "cutoff_speed": (0.6, 1.4), "motor_friction": (0.0, 0.04), "latency": (0.0, 32.0),
-    "observation_latency": (0.0, 32.0), "push_force": (-10.0, 10.0),
-}  # fmt: skip
-"""Table V, walking; the text adds that its latency applies to observations too."""
-BEYOND = {
-    "observation_latency": None, "push_interval": (0.2, 0.5), "push_probability": 0.25, "push_in_flight": False,
-    "damping_gains": None, "resample_at": "reset", "zero_latency_probability": 0.0,
-}  # fmt: skip
-"""Settings that the table does not contain, for jumping."""
 HELD = {"push_interval": None, "push_probability": 1.0}  # A push in every episode, from its beginning to its end
 ALL = PAPER | {"observation_latency": (0.0, 16.0)}  # Every row
 

@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from columns import ANG_VEL, COORDS, DOFS, LIN_VEL, MOTOR_COORDS, MOTOR_DOFS, POS, QUAT
-from jumper_warp.robot.description import LEGS, load_description
+from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
 from pinocchio_model import build_pinocchio
@@ -142,50 +142,12 @@ class Reference:
         return q, self.robot.closed_velocity(q, self.base_twist(states, i), states.rates[i])
 
     def accelerations(self, states: States, i: int, torque: np.ndarray) -> np.ndarray:
-        """Return the accelerations of state i under motor torques [N m]: 6 of the base origin in body axes, 12 motors.
-
-        Pinocchio's mass matrix and forces of the tree, reduced to the motions that keep the loops closed:
-        v = T u and dv/dt = T du/dt + b, hence T' M T du/dt = T' (tau - h - M b).
-        """
+        """Return accelerations of state i under motor torques [N m]: 6 of the base origin in body axes, 12 motors."""
         q, v = self.state(states, i)
-        robot, knees = self.robot, self.robot.knee_v
-        upper = np.triu(pin.crba(robot.model, robot.data, q))
-        mass = upper + np.triu(upper, 1).T
-        force = -pin.nonLinearEffects(robot.model, robot.data, q, v)
-        force[robot.motor_v] += torque
-        jacobian, drift = self._loops(q, v)
-        inverse = np.linalg.pinv(jacobian[:, knees], rcond=1.0e-9)
-        free = np.concatenate([np.arange(6), robot.motor_v])
-        motions, bias = np.zeros((len(v), 18)), np.zeros(len(v))
-        motions[free, np.arange(18)] = 1.0
-        motions[knees] = -inverse @ jacobian[:, free]
-        bias[knees] = -inverse @ drift
-        accelerations = np.linalg.solve(motions.T @ mass @ motions, motions.T @ (force - mass @ bias))
+        accelerations = self.robot.forward_dynamics(q, v, torque)[[*range(6), *self.robot.motor_v]]
         # Pinocchio differentiates the body-frame components; add omega x v for the acceleration of the origin
         accelerations[:3] += np.cross(v[3:6], v[:3])
         return accelerations
-
-    def _loops(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Jacobian (12, 26) and drift (12,) [m/s^2] of the gaps between the loops' anchors, world axes."""
-        robot = self.robot
-        pin.computeJointJacobians(robot.model, robot.data, q)
-        pin.forwardKinematics(robot.model, robot.data, q, v, np.zeros(len(v)))
-        rows, drifts = [], []
-        for loop in robot.constraints:
-            ends = []
-            for joint, placement in (
-                (loop.joint1_id, loop.joint1_placement), (loop.joint2_id, loop.joint2_placement),
-            ):  # fmt: skip
-                point, turn = placement.translation, robot.data.oMi[joint].rotation
-                local = pin.getJointJacobian(robot.model, robot.data, joint, pin.ReferenceFrame.LOCAL)
-                velocity, acceleration = robot.data.v[joint], robot.data.a[joint]
-                moving = velocity.linear + np.cross(velocity.angular, point)
-                spatial = acceleration.linear + np.cross(acceleration.angular, point)
-                ends.append((turn @ (local[:3] - pin.skew(point) @ local[3:]),
-                             turn @ (spatial + np.cross(velocity.angular, moving))))  # fmt: skip
-            rows.append(ends[1][0] - ends[0][0])
-            drifts.append(ends[1][1] - ends[0][1])
-        return np.vstack(rows), np.concatenate(drifts)
 
     def energy(self, states: States, i: int) -> float:
         """Return kinetic energy, rotors included, plus potential energy [J]."""
@@ -203,8 +165,3 @@ class Reference:
         """Return the robot's centre of mass [m], world, (3,)."""
         q = self.robot.configuration(states.pos[i], states.quat[i], states.angles[i])
         return pin.centerOfMass(self.robot.model, self.robot.data, q).copy()
-
-
-def paw_joint(reference: Reference, leg: int) -> int:
-    """Return Pinocchio's joint that carries a leg's paw."""
-    return reference.robot.model.getJointId(f"{LEGS[leg]}_inner_knee")

@@ -148,28 +148,6 @@ def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
     torch.distributed.destroy_process_group()
 
 
-def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
-    """Train in one of two processes, and save the networks to path + rank."""
-    join(rank, port)
-    made = []
-
-    def make_env(num_envs: int, seed: int, device: torch.device) -> PushTask:
-        made.append(PushTask(num_envs, seed, device))
-        return made[-1]
-
-    networks = []
-    original = Ppo.__init__
-
-    def begin_policy_step(self: Ppo, env: PushTask, ppo_cfg: PpoCfg) -> None:
-        original(self, env, ppo_cfg)
-        networks.append(self.model)
-
-    Ppo.__init__ = begin_policy_step
-    result = train(cfg, make_env)
-    outcome = {"model": networks[0].state_dict(), "seed": made[0].seed, "num_envs": made[0].num_envs}
-    torch.save({**outcome, "iteration": result.iteration}, path + str(rank))
-
-
 def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
     """Train in one of two processes, then again from the middle; episodes are longer than an iteration."""
 

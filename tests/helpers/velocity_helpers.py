@@ -1,7 +1,6 @@
 """Environments of velocity tracking, and functions that read and edit states of their worlds."""
 
 import numpy as np
-import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.velocity.state import VelocityState
@@ -25,8 +24,9 @@ def states_of(env: Env) -> dict[str, np.ndarray]:
 
 
 def edit(env: Env, worlds=slice(None), **fields) -> None:
-    """Overwrite fields of the worlds' states."""
-    records = env.skills[0].states.numpy().copy()
+    """Overwrite fields of the states of an environment's first task."""
+    states = env.skills[0].states
+    records = states.numpy().copy()
     for name, value in fields.items():
         records[name][worlds] = value
-    env.skills[0].states.assign(wp.array(records, dtype=VelocityState, device="cpu"))
+    states.assign(records)

@@ -10,9 +10,8 @@ from columns import Z
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
-from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
-from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, ratio, total_mass, weighed_mass
+from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
@@ -126,20 +125,6 @@ def test_residuals_of_a_standing_robot_are_linear_in_its_initial_state(standing,
     assert np.linalg.norm(change - expected) < 0.05 * np.linalg.norm(expected)
 
 
-def test_first_half_of_a_motion_has_the_first_residuals_of_the_whole(standing, replay):
-    problem, truth = standing
-    half, zero = problem.first_part(0.5), np.zeros((1, problem.start_size))
-    whole, part = (p.residuals(replay, truth[None], zero)[:, 0] for p in (problem, half))
-    assert len(part) == half.valid.sum() < 0.6 * len(whole)
-    np.testing.assert_array_equal(part, whole[: len(part)])
-
-
-def test_gram_matches_numpy():
-    rng = np.random.default_rng(0)
-    left, right = rng.normal(size=(101, 7)), rng.normal(size=(101, 3))
-    np.testing.assert_allclose(transposed_product(left, right), left.T @ right, atol=1e-12)
-
-
 def few_parameters():
     """Return kp, kd and offset of leg FL's motors, base mass, latency and knee damping: 12 parameters."""
     wanted = {f"{name}/{joint}" for name in ("kp", "kd", "offset") for joint in ("FL_lateral", "FL_outer", "FL_inner")}
@@ -220,20 +205,6 @@ def test_identify_refuses_a_recording_given_twice(standing):
             identify(motions, jumper_parameters())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"parameters": ["latency"]}, "parameters must be ParameterSet"),
-        ({"noise": {"angle": 0.1}}, "noise must be NoiseLevels or None"),
-        ({"dt": "0.001"}, "dt must be float or None"),
-        ({"dt": 0.0}, "dt must lie in 1e-6 to 0.01 s"),
-    ],
-)
-def test_identify_refuses_arguments_of_another_kind(standing, arguments, message):
-    with pytest.raises(InputError, match=message):
-        identify([standing[0].motion], **{"parameters": jumper_parameters(["latency"]), **arguments})
-
-
 def test_identify_refuses_a_robot_that_does_not_move(replay):
     parameters, rng = jumper_parameters(["latency"]), np.random.default_rng(0)
     plan, robots = sample_plan("hung chirp", rng, seconds=0.5), parameters.robots(np.zeros((1, 1)))
@@ -241,22 +212,3 @@ def test_identify_refuses_a_robot_that_does_not_move(replay):
     motion = measure(plan, "still", replay_plan(replay, plan, robots), robots, rng)
     with pytest.raises(InputError, match="identify none of 1 parameters: latency: the targets hardly change"):
         identify([motion], parameters, replay=replay)
-
-
-def test_normalised_inverts_values():
-    """Parameters in physical units are turned back into the same normalised ones, z (robots, parameters)."""
-    parameters = jumper_parameters()
-    z = np.random.default_rng(0).normal(size=(3, len(parameters)))
-    np.testing.assert_allclose(parameters.normalised(parameters.values(z)), z, atol=1e-9)
-
-
-@pytest.mark.parametrize(("prior", "factor"), [(0.2, math.e), (0.6, 10.0)])
-def test_bounds_of_a_ratio_are_five_standard_deviations_and_at_most_tenfold(prior, factor):
-    bounds = ratio("f", "paw_friction", (0,), "1", 2.0, prior, "friction").bounds
-    assert bounds == pytest.approx((2.0 / factor, 2.0 * factor), rel=1e-9)
-
-
-def test_all_79_parameters_at_their_prior_means_give_the_described_mass():
-    parameters = jumper_parameters()
-    assert len(parameters) == 79
-    assert total_mass(parameters.robots(np.zeros((2, 79)))) == pytest.approx([load_description().mass] * 2)

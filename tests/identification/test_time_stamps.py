@@ -12,7 +12,6 @@ from jumper_warp.identification.recording import measure, replay_plan, sample_pl
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals, mean_targets, pieces_of
 from jumper_warp.robot.description import load_description
-from jumper_warp.utils.errors import InputError
 
 UNIX = 1.7e9  # [s] where float64 resolves 0.24 us
 LATENCY = 0.004  # [s]
@@ -79,15 +78,6 @@ def test_origin_and_jitter_of_time_change_neither_steps_nor_rows(rate):
         np.testing.assert_allclose(other.target, exact.target, atol=0.01)  # [rad]; rows differ by 0.1
         pieces, exact_pieces = (pieces_of(moving(t), parameters, noise, robot, None) for t in (stamps, time))
         assert [piece.stride for piece in pieces] == [piece.stride for piece in exact_pieces]
-
-
-def test_motion_residuals_refuse_a_gap():
-    time = 0.1 * np.arange(9.0)
-    time[5:] += 0.002
-    with pytest.raises(InputError, match=r"gap of 0.102 s before row 5"):
-        MotionResiduals(
-            moving(time), jumper_parameters(["latency"]), NoiseLevels(), MotionReplay(threads=1).description
-        )
 
 
 def test_mean_targets_are_weighted_by_time():

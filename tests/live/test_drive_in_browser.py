@@ -98,14 +98,6 @@ def test_robot_walks_while_a_key_is_held(page, driver):
     wait_for(lambda: not page.session.velocity.any() and not page.session.command.any())
 
 
-def test_gamepad_moves_the_robot(page, driver):
-    pad = "navigator.getGamepads = () => [{axes: [0, -1, 0, 0], buttons: [{pressed: false}]}]"
-    driver.evaluate(pad)
-    wait_for(lambda: page.session.position[0] > 0.1)
-    driver.evaluate("navigator.getGamepads = () => []")
-    wait_for(lambda: not page.session.velocity.any())
-
-
 def test_click_makes_the_robot_jump_there(page, driver):
     canvas = driver.locator("canvas").first.bounding_box()
     driver.mouse.click(canvas["x"] + 0.62 * canvas["width"], canvas["y"] + 0.72 * canvas["height"])
@@ -114,33 +106,6 @@ def test_click_makes_the_robot_jump_there(page, driver):
     assert 0.2 < np.linalg.norm(goal) < 3.0
     wait_for(lambda: page.session.jump is None)
     assert np.linalg.norm(page.session.position[:2] - goal) < 0.05
-
-
-def test_jump_key_and_height(page, driver):
-    driver.keyboard.press("t")
-    wait_for(lambda: page.session.position[2] > 0.6)
-
-
-def test_friction_of_the_slider_is_that_of_the_paws(page, driver):
-    driver.get_by_role("tab", name="Robot").click()
-    friction = driver.get_by_text("friction [1]").locator("xpath=ancestor::*[.//input][1]").locator("input").last
-    friction.fill("0.1")
-    friction.press("Enter")
-    wait_for(lambda: page.session.values.get("friction [1]") == pytest.approx(0.1))
-    parameters = page.session.env.parameters
-    wait_for(lambda: np.allclose(parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()], 0.1))
-    page.post(page.session.set_value, "friction [1]", 0.85)
-    driver.get_by_role("tab", name="Drive").click()
-
-
-def test_pause_and_single_step(page, driver):
-    driver.keyboard.press("p")
-    wait_for(lambda: page.paused)
-    steps = page.steps
-    driver.keyboard.press("n")
-    wait_for(lambda: page.steps == steps + 1)
-    driver.keyboard.press("p")
-    wait_for(lambda: page.steps > steps + 2)
 
 
 async def intrude(page, messages):

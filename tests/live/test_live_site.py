@@ -3,13 +3,10 @@
 import json
 
 import numpy as np
-import pytest
 
 from jumper_warp.cli.main import main
 from jumper_warp.live import site
 from jumper_warp.policies.policy import Policy
-from jumper_warp.policies.spec import PolicyError
-from jumper_warp.utils.errors import InputError
 
 
 def test_exported_policy_has_all_weights_and_the_interface(tmp_path):
@@ -20,18 +17,6 @@ def test_exported_policy_has_all_weights_and_the_interface(tmp_path):
     assert description["skill"] == "walk"
     assert description["interface"]["action_scale"] == list(policy.interface.action_scale)
     assert np.array_equal(values, np.concatenate([each.numpy().ravel() for each in policy.tensors().values()]))
-
-
-def test_unknown_observation_is_one_line(monkeypatch):
-    monkeypatch.setattr(site, "TERMS", site.TERMS - {"gravity"})
-    with pytest.raises(PolicyError, match="mine: the page cannot compute the observation gravity"):
-        site.browser_files(Policy.load("walking_rough"), "mine")
-
-
-def test_turning_in_flight_has_no_files_for_the_page(tmp_path, capsys):
-    main(["export", "attitude", "--out", str(tmp_path / "mine")])
-    assert not (tmp_path / "mine" / "policy.json").exists()
-    assert "without files for the web page" in capsys.readouterr().err
 
 
 def test_page_and_export_name_the_same_observations():
@@ -51,8 +36,3 @@ def test_own_policies_take_the_place_of_their_skills(tmp_path, monkeypatch):
     assert scenes == {"plain": site.EARTH | {"walk": "my_walk"}}
     description = json.loads((tmp_path / "out" / "policies" / "my_walk" / "policy.json").read_text())
     assert description["interface"]["task"] == "velocity-rough"
-
-
-def test_page_refuses_two_policies_of_a_skill(tmp_path):
-    with pytest.raises(InputError, match="one policy for each skill"):
-        site.write_page(tmp_path, [Policy.load("vertical_jump"), Policy.load("mars_vertical_jump")])

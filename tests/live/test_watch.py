@@ -8,8 +8,6 @@ import pytest
 import torch
 
 from hold_height import hold_height
-from jumper_warp.cli.train import watches
-from jumper_warp.cli.watch import run as run_watch
 from jumper_warp.envs.env import Env
 from jumper_warp.live.buffer import WorldBuffer
 from jumper_warp.live.clips import ROLES, Player
@@ -17,7 +15,6 @@ from jumper_warp.live.scene import robot_scene
 from jumper_warp.live.training import TrainingWatch
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.training import train
-from jumper_warp.utils.errors import InputError
 from live_helpers import STEPS, short_training
 from toy_task import equal
 
@@ -140,22 +137,6 @@ def test_player_drops_an_episode_with_lost_steps():
     player.skip()
     player.add(rows(0, [0, 0], [7, 8]))
     assert shown(player, 4) == [1, 2, 1, 2]
-
-
-def test_a_negative_number_of_iterations_between_films_is_refused():
-    with pytest.raises(InputError, match="video_every"):
-        TrainingWatch("none", video_every=-1)
-
-
-@pytest.mark.parametrize("flags", [["--watch", "--no-watch"], ["--no-watch"], []])
-def test_the_last_of_two_flags_of_watching_counts(flags):
-    assert watches(flags) == []
-    assert len(watches([*flags, "--watch"])) == 1
-
-
-def test_a_negative_time_of_watching_is_refused(tmp_path):
-    with pytest.raises(InputError, match="seconds must be"):
-        run_watch([str(tmp_path), "--seconds", "-1"])
 
 
 class KilledWatch(TrainingWatch):

@@ -190,37 +190,12 @@ def change_model(change):
     return changed
 
 
-def first_bias(model):
-    """Return the initialiser of the first layer's bias."""
-    return next(tensor for tensor in model.graph.initializer if tensor.name == "actor_0_bias")
-
-
 def set_nan(model):
     """Write NaN into the first bias."""
-    bias = first_bias(model)
+    bias = next(tensor for tensor in model.graph.initializer if tensor.name == "actor_0_bias")
     bias.CopyFrom(onnx.numpy_helper.from_array(np.full(64, np.nan, np.float32), bias.name))
 
 
-def set_first(**changes):
-    """Return a function that changes fields of a model's first bias."""
-    return lambda model: [setattr(first_bias(model), name, value) for name, value in changes.items()]
-
-
-def reshape_block(model):
-    """Declare the first bias a repeated block with three dimensions."""
-    bias = first_bias(model)
-    bias.name = "actor_0_block"
-    bias.dims.extend([1, 1])
-
-
-def remove_files(folder):
-    """Remove network and configuration of a policy, and their checksums."""
-    edit_manifest(lambda manifest: manifest.update(sha256={}))(folder)
-    for name in ("config.json", "policy.onnx"):
-        (folder / name).unlink()
-
-
-NOT_UTF8 = b"\x3a\x06\x2a\x04\x42\x02\xff\xfe"  # Model with a graph (7) with an initialiser (5) with a name (8)
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: no such file"),
@@ -228,18 +203,11 @@ REFUSALS = {
         edit_manifest(lambda m: m.update(schema_version=2)),
         "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
-    "neither files nor checksums": (remove_files, "config.json: no such file"),
-    "no checksums": (edit_manifest(lambda m: m.update(sha256=3)), "has no table of checksums"),
     "file of another folder": (edit_manifest(lambda m: m["sha256"].update({"../x": "0"})), "names a file '../x'"),
     "weights in another file": (
         change_model(lambda m: [setattr(weight, "data_location", 1) for weight in m.graph.initializer]),
         "is in another file",
     ),
-    "weights of 4 bits": (change_model(set_first(data_type=22)), "the ONNX file cannot be read"),
-    "weights of an unknown type": (change_model(set_first(data_type=99)), "the ONNX file cannot be read"),
-    "block of three dimensions": (change_model(reshape_block), "the ONNX file cannot be read"),
-    "name that is not UTF-8": (change_model(lambda m: m.MergeFromString(NOT_UTF8)), "the ONNX file cannot be read"),
-    "layout of another type": (edit_config(lambda c: c["interface"].update(observation_layout=[])), "of another type"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
@@ -247,9 +215,6 @@ REFUSALS = {
     "NaN": (change_model(set_nan), "actor.0.bias is not finite"),
     "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_REPRODUCIBLE),
     "config of another interface": (edit_config(lambda c: c["interface"].update(policy_dt=0.02)), NOT_REPRODUCIBLE),
-    "other sizes in config": (
-        edit_config(lambda c: c["interface"].update(hidden=[64, 32, 8])), "missing or unknown: actor.3",
-    ),
 }  # fmt: skip
 """A function that damages a policy's folder (of `trained`), and the error message, by name."""
 
@@ -266,21 +231,14 @@ def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
         ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
-        (
-            {"command_filter": {"horizon": 0.1}},
-            "command_filter must have the fields lateral, transversal, sum, horizon",
-        ),
         ({"command_filter": FILTER | {"sum": FILTER["lateral"] | {"lower": 20.0}}}, "sum: lower limit must be below"),
         ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
+        ({"observation_layout": {"a": TERM | {"end": 2}}}, "observation_layout has 2 columns, the observation 1"),
+        ({"observation_layout": {"a": TERM | {"scale": math.nan}}}, "scale must lie in 1e-6 to 1e6, got nan"),
         ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
-        ({"hidden": (65537,)}, "hidden must name 1 to 64 widths from 1 to 65536"),
-        ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
         ({"command_filter": FILTER | {"horizon": True}}, "command_filter must hold numbers"),
-        ({"observation_layout": {"a": TERM | {"end": 3, "history": 1.5}}}, "first, end and history whole numbers"),
-        ({"observation_layout": {"a": TERM | {"clip": True}}}, "clip must lie in"),
     ],
 )
 def test_refuses_an_invalid_interface(change, message):
@@ -320,18 +278,6 @@ def test_onnx_runtime_agrees_with_other_activations(tmp_path, activation):
     session = onnxruntime.InferenceSession(str(export_onnx(policy, tmp_path / "p.onnx")))
     obs = torch.randn(5, 4)
     np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
-
-
-def test_onnx_metadata_has_the_interface_in_full_precision(folder, trained):
-    model = onnx.load(folder / "policy.onnx", load_external_data=False)
-    entries = {entry.key: entry.value for entry in model.metadata_props}
-    full = json.loads(entries["jumper_warp"])
-    assert full["commit"] == "abc" and full["quaternion_order"] == "xyzw"
-    assert full["policy_dt"] == 1.0 / 60.0
-    assert full["action_scale"] == list(trained.interface.action_scale)
-    assert entries["joint_names"].split(",") == list(trained.interface.joint_names)
-    assert [float(text) for text in entries["joint_stiffness"].split(",")] == full["joint_stiffness"]
-    assert len(entries["observation_names"].split(",")) == 48
 
 
 @pytest.mark.parametrize("name", policy_tasks())

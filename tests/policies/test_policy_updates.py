@@ -1,39 +1,18 @@
 """Updates of a policy's folder that are interrupted, fail on a full disk, or run at the same time."""
 
 import errno
-import itertools
-import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-import torch
 
-from jumper_warp.deploy.policy import JOINTS
 from jumper_warp.policies.catalog import add_files
 from jumper_warp.policies.policy import Policy, save_policy
-from jumper_warp.policies.spec import PolicyInterface
-from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.utils.files import write_atomically
+from landing_helpers import still_policy
 
 OLD = {"metrics.json": b"{}", "run.json": b"{}"}
 NEW = {"metrics.json": b'{"new": 1}', "run.json": b'{"new": 2}', "plot.txt": b"new"}
-
-
-def small_policy(num_obs=24):
-    """Return a policy for 12 motors that observes angles and rates, with random weights."""
-    torch.manual_seed(2)
-    term = {"scale": 1.0, "clip": 100.0, "history": 1}
-    interface = PolicyInterface.from_json({
-        "task": "vertical-jump", "observation_names": [f"obs_{i}" for i in range(num_obs)], "joint_names": list(JOINTS),
-        "action_scale": [0.3] * 12, "default_joint_pos": [0.1] * 12, "joint_stiffness": [17.0] * 12,
-        "joint_damping": [1.8] * 12, "torque_limit": [18.0] * 12, "policy_dt": 1.0 / 60.0, "physics_dt": 1.0 / 480.0,
-        "command_filter": json.loads(json.dumps(vars(vertical_jump_filter()), default=vars)), "hidden": [6, 4],
-        "activation": "elu", "observation_limit": 100.0, "normalised_limit": 10.0, "quaternion_order": "xyzw",
-        "observation_layout": {"angle": term | {"first": 0, "end": 12}, "rate": term | {"first": 12, "end": 24}},
-    })  # fmt: skip
-    layers = [(torch.randn(o, i), torch.randn(o)) for i, o in itertools.pairwise((num_obs, 6, 4, 12))]
-    return Policy(layers, torch.randn(num_obs), torch.rand(num_obs) + 0.1, interface, {"env": {"seed": 5}})
 
 
 class RenameFault:
@@ -54,7 +33,7 @@ class RenameFault:
 @pytest.fixture
 def folder(tmp_path):
     """Folder of a policy with the files `OLD`."""
-    return save_policy(tmp_path / "jump", small_policy(), files=OLD)
+    return save_policy(tmp_path / "jump", still_policy("vertical-jump"), files=OLD)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
@@ -103,24 +82,11 @@ def test_two_writers_and_a_reader_of_a_policy_leave_it_loadable(folder):
 def test_policy_loads_after_its_replacement_was_stopped_at_any_file(folder, monkeypatch, stop, after):
     monkeypatch.setattr(os, "replace", RenameFault(stop, KeyboardInterrupt(), after=after))
     with pytest.raises(KeyboardInterrupt):
-        save_policy(folder, small_policy(), overwrite=True)
+        save_policy(folder, still_policy("vertical-jump"), overwrite=True)
     Policy.load(folder)
     kept = not (after and stop == 5)
     assert (folder / "metrics.json").exists() is kept
     assert [path.name for path in folder.parent.iterdir()] == ["jump"]
-
-
-def test_threads_may_write_one_file_at_a_time(tmp_path):
-    contents = [bytes([65 + i]) * 10_000 * (i + 1) for i in range(4)]
-
-    def write(content):
-        for _ in range(50):
-            write_atomically(tmp_path / "file", content)
-            assert (tmp_path / "file").read_bytes() in contents
-
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(write, contents)) == 4 * [None]
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
 
 
 def test_part_of_a_killed_write_is_replaced(tmp_path):

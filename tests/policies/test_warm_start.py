@@ -5,11 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.policies.policy import Policy, actor_init_from_policy, check_interface, task_symmetry
+from jumper_warp.policies.policy import Policy, actor_init_from_policy, task_symmetry
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init, make_actor_init
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.tasks.interface import interface
 from jumper_warp.utils.errors import InputError
 
 WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a symmetric actor has twice the widths
@@ -64,10 +63,3 @@ def test_symmetric_training_starts_from_the_projection_of_a_nearly_symmetric_pol
     obs = policy.mean + policy.std * torch.randn(500, 147, generator=generator)
     assert start.change == "made mirror-symmetric"
     assert 0.0 < (model.act(obs) - near.act(obs)).abs().mean() < 0.01
-
-
-def test_scales_gains_and_an_unknown_layout_may_differ():
-    spec = Policy.load("horizontal_jump").interface
-    numbers = {name: tuple(1.5 for _ in spec.joint_names) for name in ("action_scale", "joint_stiffness")}
-    other = dataclasses.replace(spec, **numbers, observation_layout={}, policy_dt=0.05)
-    check_interface(other, interface(make_task("horizontal-jump-mars")))

@@ -116,13 +116,6 @@ def test_symmetric_training_starts_from_the_mirror_averaged_policy():
     torch.testing.assert_close(std[SYMMETRY.obs.order], std)
 
 
-def test_policy_with_asymmetric_statistics_is_averaged_with_its_mirror_image():
-    model = actor(symmetry=SYMMETRY)
-    model.obs_moments.mean[1] = 0.1  # a symmetric mean is 0
-    start = actor_init_of(model, dataclasses.replace(SYMMETRIC, hidden=(64, 64)))
-    assert "averaged" in start.change and not actor_init_of(actor(symmetry=SYMMETRY), SYMMETRIC).change
-
-
 def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
     exact = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()

@@ -53,11 +53,3 @@ def test_logged_rewards_are_means_over_the_episodes_that_ended_since_the_last_lo
         assert np.count_nonzero(terms) > 10
         lengths += [episode[2] for episode in new]
     assert len(set(lengths)) > 3 and max(lengths) == LIMIT
-
-
-@pytest.mark.parametrize(
-    ("name", "seconds"),
-    [("vertical-jump", 20.0), ("horizontal-jump", 20.0), ("velocity-flat", 20.0), ("attitude", 4.0)],
-)
-def test_time_limit_of_a_task_is_that_of_its_termination(name, seconds):
-    assert make_task(name).max_episode_length_s(1.0 / 60.0) == pytest.approx(seconds)

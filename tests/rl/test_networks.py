@@ -37,11 +37,6 @@ def test_batch_moments_do_not_depend_on_the_chunk_size(chunk_size):
     np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 
 
-def test_initial_running_moments_normalise_as_the_identity():
-    x = torch.tensor([[3.0, -4.0]])
-    torch.testing.assert_close(RunningMoments((2,)).scaling().normalise(x), x, rtol=1e-6, atol=0.0)
-
-
 def test_act_returns_the_mean_clipped_to_1():
     model = ActorCritic(2, 1, (4,))
     torch.nn.init.constant_(model.actor[-1].bias, 3.0)  # observations of 0 give a mean of 3

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 from jumper_warp.rl.checkpoint import latest_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.locks import LOCK
 from toy_task import PushTask, push_cfg
 
 HOLDER = """
@@ -50,10 +48,3 @@ def test_second_writer_is_refused_and_changes_nothing(cfg, holder):
         train(cfg, PushTask)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert latest_checkpoint(folder / CHECKPOINTS).state["iteration"] == 2  # readers need no lock
-
-
-def test_lock_file_of_a_killed_process_does_not_block(cfg, holder):
-    holder.send_signal(signal.SIGKILL)
-    holder.wait()
-    assert (Path(cfg.resume) / LOCK).is_file()
-    assert train(cfg, PushTask).iteration == 4

@@ -45,12 +45,6 @@ def test_mirrored_observation_gives_the_mirrored_action():
     assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1  # f alone is not
 
 
-def test_symmetric_observation_gives_a_symmetric_action():
-    model, x = walker(), torch.randn(64, NUM_OBS)
-    action = model.mean(0.5 * (x + mirrored(x, OBS)))
-    torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)  # motors of legs FL and FR
-
-
 @pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
 def test_expanded_plain_network_has_the_same_output(hidden):
     model, x = walker(hidden), torch.randn(16, NUM_OBS)
@@ -114,15 +108,3 @@ def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):
     obs = torch.randn(30, NUM_OBS)
     torch.testing.assert_close(policy.act(obs), model.act(obs), atol=1e-5, rtol=1e-5)
     assert policy.interface.sizes == (NUM_OBS, 16, 12, 12)
-
-
-def test_symmetric_actor_resumes_only_with_the_same_symmetry():
-    first, second = Ppo(PushTask(8), CFG), Ppo(PushTask(8), CFG)
-    second.load_state_dict(first.state_dict())
-    assert torch.equal(first.flat.value, second.flat.value)
-    wrong = first.state_dict()
-    wrong["model"]["mirror_obs_order"] = wrong["model"]["mirror_obs_order"].flip(0)
-    with pytest.raises(InputError, match="mirror_obs_order is for another observation"):
-        second.load_state_dict(wrong)
-    with pytest.raises(RuntimeError, match=r'Unexpected key\(s\) in state_dict: "mirror_'):
-        Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())

@@ -41,19 +41,6 @@ def test_paw_is_merged_into_the_inner_shank_by_the_parallel_axis_theorem(descrip
     assert shank.inertia[0, 2] == pytest.approx(-6.7e-5 + 3.9283e-5, rel=1e-3)
 
 
-def test_mirrored_legs_have_products_of_inertia_of_opposite_sign(description):
-    products = [description.link(f"{leg}_housing").inertia[0, 1] for leg in ("FL", "FR", "BL", "BR")]
-    assert products == [-0.000296, 0.000296, 0.000296, -0.000296]
-
-
-def test_leg_dimensions_of_the_back_right_leg(description):
-    leg = leg_dimensions(description, "BR")
-    assert leg.hip == (-0.1433, -0.15, 0.0)  # [m]
-    assert (leg.front, leg.side) == (-1.0, -1.0)  # back, right
-    assert (leg.outer_x, leg.inner_x, leg.plane_y, leg.knee_y) == (-0.1417, -0.0517, -0.05945, -0.00075)
-    assert (leg.thigh, leg.shank, leg.paw_radius) == (0.175, 0.3, 0.025)
-
-
 @pytest.mark.parametrize("leg", ["FL", "BR"])
 @pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # both thighs; [m]
 def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degrees, depth):
@@ -63,24 +50,6 @@ def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degree
     # the leg is symmetric: each shank leans by asin((0.045 + 0.175 sin q) / 0.3)
     lean = math.asin((0.045 + 0.175 * math.sin(angle)) / 0.3)
     assert (outer_knee, inner_knee) == pytest.approx((angle + lean, angle + lean))
-
-
-def test_refuses_leg_with_coinciding_knees_at_minus_14_9_degrees(description):
-    angle = -math.asin(0.045 / 0.175)  # half the distance of the thigh axes over the thigh length
-    assert math.degrees(angle) == pytest.approx(-14.9, abs=0.05)
-    with pytest.raises(ValueError, match="cannot connect knees"):
-        knee_angles(leg_dimensions(description, "FL"), angle, angle)
-
-
-def test_stops_of_lateral_outer_and_transversal_sum(description):
-    lateral, outer = [np.degrees((joint.lower, joint.upper)) for joint in description.joints[:2]]
-    assert lateral == pytest.approx((-50.0, 110.0), abs=1e-3)
-    assert outer == pytest.approx((-30.0, 140.0), abs=1e-3)
-    assert np.degrees(description.transversal_sum) == pytest.approx((0.0, 240.0))
-
-
-def test_default_pose_has_transversals_at_45_degrees(description):
-    assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
 
 
 @pytest.mark.parametrize("leg", LEGS)

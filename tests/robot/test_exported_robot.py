@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from jumper_warp.robot.description import MOTOR_JOINTS, load_description
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors
@@ -116,73 +117,21 @@ def apex_in_solver_mujoco(rate):
     return apex
 
 
-def pinocchio_swing():
-    """Let the legs of robot_urdf/ swing for 0.1 s in Pinocchio; return FL's outer angle [rad], largest loop gap [m]."""
+def test_loop_closures_of_the_urdf_are_those_of_the_description(exported):
     yaml = pytest.importorskip("yaml")
-    model = pin.buildModelFromUrdf("robot_urdf/jumper.urdf")  # pin.JointModelFreeFlyer() as second argument: floating
-    with open("robot_urdf/loop_closures.yaml") as text:
-        file = yaml.safe_load(text)
-    q, v = pin.neutral(model), np.zeros(model.nv)
+    file, robot = yaml.safe_load((exported / "robot_urdf" / "loop_closures.yaml").read_text()), load_description()
+    model = pin.buildModelFromUrdf(str(exported / "robot_urdf" / "jumper.urdf"))
+    assert [file["default_pose"][name] for name in MOTOR_JOINTS] == pytest.approx(list(robot.pose("default")))
+    q = pin.neutral(model)
     for name, angle in file["default_pose"].items():
         q[model.joints[model.getJointId(name)].idx_q] = angle
-    loops, loop_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
-    for loop in file["loops"]:
-        ends = []
-        for joint, point in zip(loop["joints"], loop["points"], strict=True):
-            ends += [model.getJointId(joint), pin.SE3(np.eye(3), np.array(point))]
-        constraint = pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *ends, pin.ReferenceFrame.LOCAL)
-        constraint.m_baumgarte_parameters.Kp, constraint.m_baumgarte_parameters.Kd = 1.0e4, 200.0
-        loops.append(constraint)
-        loop_data.append(constraint.createData())
     data = model.createData()
-    pin.initConstraintDynamics(model, data, loops, loop_data)
-    settings = pin.ProximalSettings(1.0e-10, 1.0e-10, 20)  # a planar loop has three rows of rank two
-    for _ in range(480):
-        dv = pin.constraintDynamics(model, data, q, v, np.zeros(model.nv), loops, loop_data, settings)
-        v = v + dv / 4800.0
-        q = pin.integrate(model, q, v / 4800.0)
     pin.forwardKinematics(model, data, q)
-    gap = max(
-        np.linalg.norm(
-            data.oMi[loop.joint1_id].act(loop.joint1_placement.translation)
-            - data.oMi[loop.joint2_id].act(loop.joint2_placement.translation)
-        )
-        for loop in loops
-    )
-    outer = q[model.joints[model.getJointId("FL_outer")].idx_q]
-    return outer, gap
-
-
-def test_loops_of_the_urdf_stay_closed_and_legs_swing_as_in_mujoco(exported):
-    outer, gap = pinocchio_swing()
-    assert gap < 1e-5  # [m]
-    assert outer == pytest.approx(swing_in_mujoco(exported / "robot_mjcf" / "jumper.xml"), abs=0.01)  # [rad]
-
-
-def swing_in_mujoco(file):
-    """Return the front left outer thigh's angle [rad] after 0.1 s with a fixed body and neither motors nor armature."""
-    spec = mujoco.MjSpec.from_file(str(file))
-    pose = np.array(spec.key("default").qpos)
-    for part in [spec.joint("base"), spec.geom("ground"), *spec.keys, *spec.tendons, *spec.actuators]:
-        spec.delete(part)
-    model = spec.compile()
-    model.dof_armature[:], model.dof_frictionloss[:] = 0.0, 0.0
-    model.opt.timestep = 1.0 / 4800.0
-    data = mujoco.MjData(model)
-    data.qpos[:] = pose[7:]
-    mujoco.mj_step(model, data, nstep=480)
-    return data.joint("FL_outer").qpos[0]
-
-
-def test_mujoco_keeps_all_masses_of_the_urdf_and_the_base_can_be_freed(exported):
-    spec = mujoco.MjSpec.from_file("robot_urdf/jumper.urdf")
-    spec.body("body").add_freejoint()
-    tree = spec.compile()
-    fixed = mujoco.MjModel.from_xml_path("robot_urdf/jumper.urdf")
-    assert (fixed.nv, tree.nq, tree.nv) == (20, 27, 26)
-    for model in (fixed, tree):
-        assert model.body_mass.sum() == pytest.approx(14.5, abs=1e-9)  # [kg]
-        assert model.nbody == 22 and model.nmesh == 4
+    for loop, described in zip(file["loops"], robot.loops, strict=True):
+        np.testing.assert_allclose(loop["points"], [described.parent_anchor, described.child_anchor])
+        first, second = (data.oMi[model.getJointId(joint)].act(np.array(point))
+                         for joint, point in zip(loop["joints"], loop["points"], strict=True))  # fmt: skip
+        np.testing.assert_allclose(first, second, atol=1e-5)  # [m] closed
 
 
 def test_newton_reads_masses_stops_and_loops_from_usd(exported):
@@ -212,9 +161,6 @@ def test_newton_reads_masses_stops_and_loops_from_usd(exported):
                     getattr(model, quantity).numpy()[dof] for model, dof in zip((read, described), dofs, strict=True)
                 ]
                 assert values[0] == pytest.approx(values[1], abs=1e-6), f"{name} {quantity}"
-    state = read.state()
-    newton.eval_fk(read, read.joint_q, read.joint_qd, state)
-    assert largest_gap(read, state) < 1e-6  # [m], in the pose that the file holds
 
 
 def by_name(model, kind):
@@ -233,16 +179,3 @@ def assert_same_loop(read, first, described, second):
         assert labels[0] == labels[1]
         np.testing.assert_allclose(*points, atol=1e-7)
     assert read.articulation_count == 1 and first >= read.articulation_end.numpy()[0]
-
-
-def largest_gap(model, state):
-    """Return the largest distance [m] between the two ends of an ankle."""
-    gaps = []
-    for joint in (index for name, index in by_name(model, "joint").items() if name.endswith("ankle")):
-        ends = []
-        for end in ("parent", "child"):
-            x, y, z, qx, qy, qz, w = state.body_q.numpy()[getattr(model, f"joint_{end}").numpy()[joint]]
-            point, axis = getattr(model, f"joint_X_{end[0]}").numpy()[joint, :3], np.array([qx, qy, qz])
-            ends.append(np.array([x, y, z]) + point + 2.0 * np.cross(axis, np.cross(axis, point) + w * point))
-        gaps.append(np.linalg.norm(ends[0] - ends[1]))
-    return max(gaps)

@@ -45,19 +45,6 @@ def test_uneven_ground_is_reproducible_by_seed():
     assert np.abs(first - heights(grounds.uneven(seed=4))).max() > 0.02
 
 
-@pytest.mark.parametrize("field", [grounds.platform(0.1), grounds.uneven()])
-def test_default_grounds_have_cells_within_a_paw_radius_and_a_half_width_of_2_m(field):
-    assert (field.hx, field.hy) == (2.0, 2.0)
-    assert 2.0 * field.hx / (field.ncol - 1) <= 0.0251
-    assert field.nrow == field.ncol
-
-
-def test_cells_shrink_to_divide_the_size():
-    field = grounds.platform(0.1, edge=0.3, size=1.0, cell=0.03)
-    assert field.ncol == 35  # ceil(1.0 / 0.03) cells
-    assert heights(field)[0, -1] == pytest.approx(0.1)
-
-
 def dropped(field, offset, lift, num_worlds=1):
     """Return a simulation of robots in the standing pose at x = offset [m], paws at z = lift [m], before they fall."""
     sim = simulation(num_worlds, ground=field)

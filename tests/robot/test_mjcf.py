@@ -13,7 +13,6 @@ from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.mujoco import mujoco_solver
-from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.assets import ASSETS
 from pinocchio_model import build_pinocchio
 
@@ -114,20 +113,6 @@ def test_dropped_robot_keeps_its_loops_closed_and_its_legs_within_the_stop_of_th
         sums += [data.joint(f"{leg}_outer").qpos[0] + data.joint(f"{leg}_inner").qpos[0] for leg in LEGS]
     assert gap < 1e-3 and lowest > 0.02  # [m]
     assert -math.radians(2.0) < min(sums) < math.radians(2.0)
-
-
-def standing_in_solver_mujoco():
-    """Return the base's height [m] after 2 s in the default pose on this project's SolverMuJoCo."""
-    simulation = Simulation(1, solver="mujoco", device="cpu", visuals=False)
-    for _ in range(120):
-        simulation.step()
-    return simulation.joint_q()[0, 2]
-
-
-def test_robot_stands_as_high_as_in_solver_mujoco():
-    model, data = load()
-    mujoco.mj_step(model, data, nstep=960)
-    assert data.qpos[2] == pytest.approx(standing_in_solver_mujoco(), abs=0.002)  # [m]
 
 
 def test_motors_and_knee_dampers_stay_within_their_torques():

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from jumper_warp.cli.train import overlay_in
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.registry import make_task
@@ -36,17 +35,8 @@ def test_load_overlay_inverts_save(tmp_path):
     [
         ({"values": {"colour": [1.0]}}, "unknown quantity 'colour'"),
         ({"values": {"kp": [1.0]}}, r"kp needs 12 values, got shape \(1,\)"),
-        ({"values": {"kp": [[1.0, 2.0], *11 * [1.0]]}}, "kp must be an array of numbers"),
-        ({"randomization": {"base_mass": [-0.1, []]}}, "base_mass must be an array of numbers"),
         ({"values": {"base_mass": [7000.0]}}, "base_mass must be in 0.001 to 100 kg"),
-        (
-            {"values": {"kp": 12 * [20.0]}},
-            r"kp must be in 0.05 to 3 times the described value \(1: as described\), got 20$",
-        ),
-        (
-            {"value": {"kp": 12 * [1.1]}},
-            "unknown section 'value'; expected one of schema, source, robot, values, random",
-        ),
+        ({"value": {"kp": 12 * [1.1]}}, "unknown section 'value'; expected one of schema, source, robot, values"),
         ({"values": {"cutoff_speed": 12 * [60.0]}}, "below the no_load_speed"),
     ],
 )
@@ -95,10 +85,3 @@ def test_environment_randomises_around_overlay_and_saves_it():
     offset = np.degrees(env.sim.motors.offset.numpy() - np.array(VALUES["offset"])[:, None])
     assert np.abs(offset).max() <= 0.2 + 1e-5 and np.ptp(offset) > 0.2
     assert set(env.parameters.latency.numpy()) <= {1, 2}  # 3 to 5 ms
-
-
-def test_overlay_is_read_from_both_forms_of_the_training_flag(tmp_path):
-    RobotOverlay(VALUES, RANGES).save(tmp_path / "robot.json")
-    assert overlay_in(["--seed", "1"]) is None
-    assert overlay_in(["--robot", str(tmp_path / "robot.json")]).values["base_mass"] == (7.0,)
-    assert overlay_in([f"--robot={tmp_path / 'robot.json'}"]).randomization == RANGES

@@ -1,22 +1,17 @@
 """Newton's model of the robot: layout, poses, contacts and dynamics, against hand calculations and Pinocchio."""
 
 import dataclasses
-import importlib
 import math
 
 import newton
 import numpy as np
 import pytest
-import warp as wp
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from columns import COORDS, DOFS, MOTOR_COORDS, MOTOR_DOFS, POS, X, Y, Z
+from columns import COORDS, DOFS, POS, X, Y, Z
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.model import build_model, leg_geometry, leg_geometry_array, standing_configuration
+from jumper_warp.robot.model import build_model, leg_geometry, standing_configuration
 from jumper_warp.sim.mujoco import mujoco_solver
-from jumper_warp.sim.precision import float64_kernels
-from pinocchio_model import build_pinocchio
 
 LEGS = ("FL", "FR", "BL", "BR")
 FRONT = np.array([1, 1, -1, -1])  # sign of x by leg
@@ -106,38 +101,19 @@ def test_loop_coordinates_are_relative_rotations_of_shanks(model):
         assert (stored.inv() * relative).magnitude() < 1e-6
 
 
-def test_positive_lateral_swings_the_paw_outward(model):
+@pytest.mark.parametrize(
+    # joint and link among the five of a leg, length [m], axis, side to which the link's end moves (1: outward), [m]
+    ("joint", "link", "length", "axis", "side", "least"),
+    [(0, 4, 0.3, Y, SIDE, 0.03), (1, 1, 0.175, X, FRONT, 0.01), (3, 3, 0.175, X, -FRONT, 0.01),
+     (2, 2, 0.3, X, -FRONT, 0.01), (4, 4, 0.3, X, FRONT, 0.01)],
+    ids=["lateral", "outer thigh", "inner thigh", "outer knee", "inner knee"],
+)  # fmt: skip
+def test_positive_angle_moves_the_end_of_a_link(model, joint, link, length, axis, side, least):
     joint_q = model.joint_q.numpy()[:COORDS].astype(float)
-    before = far_ends(model, joint_q, link=4, length=0.3)
-    joint_q[MOTOR_COORDS[0::3]] += 0.1  # [rad] all laterals
-    moved = far_ends(model, joint_q, link=4, length=0.3) - before
-    assert (SIDE * moved[:, Y] > 0.03).all()
-
-
-@pytest.mark.parametrize(  # joint and link among the five of a leg; direction: 1 away from the robot's centre
-    ("joint", "link", "direction"), [(1, 1, 1), (3, 3, -1)], ids=["outer", "inner"]
-)
-def test_positive_thigh_angle_moves_its_tip_away_from_its_twin(model, joint, link, direction):
-    joint_q = model.joint_q.numpy()[:COORDS].astype(float)
-    before = far_ends(model, joint_q, link, 0.175)
-    joint_q[7 + joint : 27 : 5] += 0.1
-    moved = far_ends(model, joint_q, link, 0.175) - before
-    assert (direction * FRONT * moved[:, X] > 0.01).all()
-
-
-@pytest.mark.parametrize("joint", [2, 4], ids=["outer", "inner"])
-def test_positive_knee_angle_folds_the_shank_under_the_body(model, joint):
-    # in the default pose the knees point away from each other, and each shank swings toward the other
-    joint_q = model.joint_q.numpy()[:COORDS].astype(float)
-    before = far_ends(model, joint_q, joint, 0.3)
-    joint_q[7 + joint : 27 : 5] += 0.1
-    moved = far_ends(model, joint_q, joint, 0.3) - before
-    direction = -1 if joint == 2 else 1
-    assert (direction * FRONT * moved[:, X] > 0.01).all()
-
-
-def test_nominal_pose_stands_at_the_nominal_height(description):
-    assert standing_configuration(description, "nominal")[2] == pytest.approx(0.35, abs=2e-3)  # [m]
+    before = far_ends(model, joint_q, link, length)
+    joint_q[7 + joint : 27 : 5] += 0.1  # [rad]
+    moved = far_ends(model, joint_q, link, length) - before
+    assert (side * moved[:, axis] > least).all()
 
 
 def test_standing_height_with_the_legs_swung_outward(model, description):
@@ -157,16 +133,6 @@ def test_leg_geometry_matches_joint_origins(description):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("package", "bits"), [("jumper_warp.kernels", 32), ("jumper_warp.kernels_float64", 64)])
-def test_leg_geometry_array_in_both_precisions(description, package, bits):
-    float64_kernels()
-    module = importlib.import_module(f"{package}.kinematics.geometry")
-    legs = leg_geometry_array(description, module, device="cpu").numpy()
-    assert legs["thigh"].dtype == f"float{bits}"
-    assert legs["outer_x"] == pytest.approx(0.1417 * FRONT, rel=1e-6)  # [m], as in the test above
-    assert legs["hip"][:, Y] == pytest.approx([0.105, -0.105, 0.15, -0.15], rel=1e-6)  # FL, FR, BL, BR
-
-
 def test_only_paws_collide_with_the_ground():
     solver = mujoco_solver(build_model(1, visuals=False, device="cpu"))
     kind, affinity = solver.mj_model.geom_contype, solver.mj_model.geom_conaffinity
@@ -174,93 +140,6 @@ def test_only_paws_collide_with_the_ground():
     # the ground belongs to no world and comes first
     assert collides[0, 1:].all()
     assert not collides[1:, 1:].any()
-
-
-def test_contact_has_the_paw_friction_and_is_stiff():
-    model = build_model(1, friction=0.6, visuals=False, device="cpu")
-    solver = mujoco_solver(model)
-    joint_q = model.joint_q.numpy()
-    joint_q[2] -= 1e-3  # [m] paws into the ground
-    model.joint_q.assign(joint_q)
-    state, control = model.state(), model.control()
-    solver.step(state, state, control, None, 1.0 / 480.0)
-    contact = solver.mjw_data.contact
-    assert solver.mjw_data.nacon.numpy()[0] == 4
-    assert contact.friction.numpy()[:4, 0] == pytest.approx(np.full(4, 0.6))
-    assert contact.solref.numpy()[:4] == pytest.approx(np.tile([2.0 / 476.0, 1.0], (4, 1)), rel=1e-3)
-    assert contact.solimp.numpy()[:4, :2] == pytest.approx(np.tile([0.95, 0.99], (4, 1)))
-
-
-def standing_energy(angle):
-    """Return base height [m] and energy [J] with all thighs at an angle [rad] and motors of 17 N m/rad held at 45 deg.
-
-    In the leg's plane each shank leans by asin((0.045 + 0.175 sin q) / 0.3); heights follow from the paws upward.
-    """
-    lean = math.asin((0.045 + 0.175 * math.sin(angle)) / 0.3)
-    knee = 0.025 + 0.3 * math.cos(lean)
-    hip = knee + 0.175 * math.cos(angle)
-    # two thighs, the outer shank, the inner shank with its paw: mass times height of each centre of mass
-    thighs = 2 * 0.081 * (hip - 0.0594 * math.cos(angle))
-    shanks = 0.1992 * (knee - 0.1647 * math.cos(lean)) + 0.2193 * (knee - 0.1927 * math.cos(lean))
-    weight = 9.81 * ((14.5 - 4 * 0.5805) * hip + 4 * (thighs + shanks))
-    springs = 8 * 0.5 * 17.0 * (angle - math.pi / 4.0) ** 2
-    return hip, weight + springs
-
-
-def test_robot_stands_at_the_height_of_least_energy_with_closed_loops():
-    model = build_model(1, visuals=False, device="cpu")
-    solver = mujoco_solver(model)
-    state, control = model.state(), model.control()
-    target = np.radians([0.0, 45.0, 45.0] * 4)
-    damping = np.array([1.8, 0.8, 0.8] * 4)
-    torque = np.zeros(DOFS, dtype=np.float32)
-    for _ in range(200):  # 0.42 s
-        angle, rate = state.joint_q.numpy()[MOTOR_COORDS], state.joint_qd.numpy()[MOTOR_DOFS]
-        torque[MOTOR_DOFS] = 17.0 * (target - angle) - damping * rate
-        control.joint_f.assign(torque)
-        solver.step(state, state, control, None, 1.0 / 480.0)
-    joint_q = state.joint_q.numpy()
-    assert np.isfinite(joint_q).all()
-    sagged = minimize_scalar(lambda angle: standing_energy(angle)[1], bounds=(0.5, 1.5), method="bounded").x
-    assert joint_q[2] == pytest.approx(standing_energy(sagged)[0], abs=0.003)
-    assert joint_q[3:7] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=0.02)
-    gap = far_ends(model, joint_q, 2, 0.3) - far_ends(model, joint_q, 4, 0.3)
-    assert np.abs(gap).max() < 1e-3
-
-
-def test_accelerations_in_flight_agree_with_pinocchio(description):
-    rng = np.random.default_rng(7)
-    motors = description.pose("default") + rng.uniform(-0.4, 0.4, 12)
-    quat = Rotation.from_euler("xyz", [0.4, -0.3, 1.0]).as_quat()
-    torques = rng.uniform(-10.0, 10.0, 12)
-    reference = build_pinocchio(description)
-    q = reference.configuration([0.0, 0.0, 1.0], quat, motors)
-    expected = reference.forward_dynamics(q, np.zeros(26), torques)
-
-    model = build_model(1, ground=None, visuals=False, device="cpu")
-    model.joint_friction.zero_()
-    joint_q = model.joint_q.numpy()
-    joint_q[:7] = q[:7]
-    joint_q[MOTOR_COORDS] = motors
-    knees = np.array([9 + 5 * leg + 2 * bar for leg in range(4) for bar in (0, 1)])
-    joint_q[knees] = q[reference.knee_q]
-    model.joint_q.assign(joint_q)
-    state, control = model.state(), model.control()
-    forces = np.zeros(DOFS, dtype=np.float32)
-    forces[MOTOR_DOFS] = torques
-    control.joint_f.assign(forces)
-    solver = mujoco_solver(model, iterations=50, integrator="euler")
-    solver.mjw_model.eq_solimp.fill_(wp.types.vector(5, float)(0.9999, 0.9999, 0.001, 0.5, 2.0))  # all but rigid loops
-    for _ in range(3):  # the solver warm-starts from the previous call
-        solver.step(state, model.state(), control, None, 1.0e-5)
-    accelerations = solver.mjw_data.qacc.numpy()[0]
-
-    scale = np.abs(expected).max()
-    # MuJoCo: linear acceleration of the base in the world frame, angular in the body frame
-    assert accelerations[:3] == pytest.approx(Rotation.from_quat(quat).apply(expected[:3]), abs=3e-4 * scale)
-    assert accelerations[3:6] == pytest.approx(expected[3:6], abs=3e-4 * scale)
-    assert accelerations[MOTOR_DOFS] == pytest.approx(expected[reference.motor_v], abs=3e-4 * scale)
-    assert accelerations[knees - 1] == pytest.approx(expected[reference.knee_v], abs=3e-4 * scale)
 
 
 def test_robot_slides_on_mujoco_with_the_least_friction():

@@ -1,7 +1,6 @@
 """Robots from tables: reading, refusals, lengths of overlays, and their dynamics and kinematics against Pinocchio."""
 
 import copy
-import dataclasses
 
 import numpy as np
 import pytest
@@ -122,19 +121,11 @@ def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
     [
         (lambda table: table.pop("back"), "section 'back' is missing: .* Newton or mjlab"),
         (lambda table: table.update(middle={}), "unknown section 'middle': .* Newton or mjlab"),
-        (lambda table: table.update(motors=[]), "section 'motors' must be an object"),
-        (lambda table: table.update(FL=None), "section 'FL' must be an object, got None"),
         (lambda table: table["front"].pop("outer_shank"), "front: outer_shank needs .* Newton or mjlab"),
         (lambda table: table["front"].update(knees={}), "front: unknown quantity 'knees'"),
         (lambda table: table["front"]["thigh"].update(unit="mm"), "front: the unit of thigh is m, got 'mm'"),
         (lambda table: set_value(table["front"], "hip", [0.1, 0.1]), "front: hip must be 3 finite numbers"),
-        (lambda table: set_value(table["front"], "hip", [0.1, "0.1", 0.1]), "front: hip must be 3 finite numbers"),
-        (lambda table: set_value(table["front"], "thigh", {}), "front: thigh must be 1 finite number"),
-        (lambda table: set_value(table["front"], "thigh", "0.2"), "front: thigh must be 1 finite number"),
-        (lambda table: set_value(table["front"], "thigh", True), "front: thigh must be 1 finite number"),
-        (lambda table: set_value(table["body"], "mass", 10**40), "body: mass must be 1 finite number"),
         (lambda table: set_value(table["body"], "mass", 0.0), "body: mass must be 1 finite number, positive"),
-        (lambda table: set_value(table["front"], "housing_mass", 0), "front: housing_mass must be .* positive"),
         (lambda table: set_value(table["body"], "inertia", [-1, 1, 1, 0, 0, 0]), "body: the principal moments"),
         (lambda table: set_value(next(iter(table["motors"].values())), "peak_torque", 0.0), "peak_torque .* positive"),
         (lambda table: set_value(table["front"], "outer_shank", 0.01), "shanks of 0.01 and 0.28 m cannot connect"),
@@ -146,11 +137,3 @@ def test_refuses_bad_table(change, message):
     change(table)
     with pytest.raises(InputError, match=message):
         robot_of(table)
-
-
-def test_robots_of_one_environment_need_equal_poses():
-    robots = [robot_of(odd_table()), dataclasses.replace(robot_of(odd_table()), poses={"default": (0.0, 0.5)})]
-    from jumper_warp.robot.model import build_model
-
-    with pytest.raises(InputError, match="equal poses"):
-        build_model(2, description=robots, device="cpu")

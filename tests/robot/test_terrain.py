@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ground_helpers import heights, probe
-from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile, terrain_map, tile_heights
+from jumper_warp.robot.terrain import KINDS, TerrainCfg, terrain_map, tile_heights
 
 CFG = TerrainCfg(rows=2, tile=4.0, cell=0.1, start=0.5, border=1.0)
 NODES = 41  # along an edge of 4 m
@@ -73,9 +73,3 @@ def test_map_places_tiles_by_row_and_column():
     slope = np.tan(np.radians(15.0))
     assert z == pytest.approx([1.2 * slope, 0.7 * slope, 0.2 * slope], abs=1e-5)
     assert slope_x[1] == pytest.approx(-slope, abs=1e-4) and slope_y[2] == pytest.approx(-slope, abs=1e-4)
-
-
-def test_single_tile_has_full_difficulty():
-    field = single_tile(CFG, "stairs")
-    np.testing.assert_allclose(heights(field), tile("stairs"), atol=1e-6)
-    assert (field.hx, field.hy) == (2.0, 2.0)

@@ -9,14 +9,11 @@ import warp as wp
 from newton.sensors import SensorIMU
 from scipy.spatial.transform import Rotation
 
-from columns import DOFS, MOTOR_DOFS
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.model_parts import NotThisRobotError
-from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 
-DT = 1.0 / 480.0
 CORNER = (0.3, 0.05, 0.1)  # [m], body frame
 TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])  # of the site at the corner
 GHOST = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
@@ -73,25 +70,6 @@ def test_extras_keep_labels_and_masses_of_the_robot_and_are_in_every_world():
         assert labels == [f"world_0/{name}", f"world_1/{name}"]
 
 
-@pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_imu_on_a_site_of_a_standing_robot_measures_gravity(solver):
-    sim = Simulation(1, solver=solver, visuals=False, device="cpu", extras=corner_site)
-    sensor = SensorIMU(sim.model, sites="*/corner", request_state_attributes=False)
-    observables = sim.solver.observables(kinds=sensor.solver_observable_kinds)
-    for _ in range(120):
-        sim.step()
-    if solver == "jumper":
-        forces = np.zeros(DOFS, dtype=np.float32)
-        forces[MOTOR_DOFS] = sim.torque.numpy()[:, 0]
-        sim.control.joint_f.assign(forces)
-    sim.solver.step(sim.state, sim.state, sim.control, None, DT, observables=observables)
-    sensor.update(sim.state, observables=observables)
-    turn = Rotation.from_quat(sim.joint_q()[0, 3:7]) * TILT
-    # [m/s^2], [rad/s]: on MuJoCo the robot still oscillates slightly
-    assert sensor.accelerometer.numpy()[0] == pytest.approx(turn.inv().apply([0.0, 0.0, 9.81]), abs=0.1)
-    assert sensor.gyroscope.numpy()[0] == pytest.approx(np.zeros(3), abs=0.02)
-
-
 def test_imu_on_a_falling_and_rotating_robot_measures_centripetal_acceleration():
     sim = Simulation(1, ground=None, visuals=False, device="cpu", extras=corner_site)
     sensor = SensorIMU(sim.model, sites="*/corner", request_state_attributes=False)
@@ -132,25 +110,3 @@ def test_solver_refuses_bodies_joints_and_particles(extras, part):
     with pytest.raises(NotThisRobotError, match=f"{part}.*this robot alone") as refusal:
         SolverJumper(model)
     assert "\n" not in str(refusal.value)
-
-
-def farthest_paw(model):
-    """Return the largest x [m] of the FL paw's surface when the unactuated robot slides along x at 3 m/s on MuJoCo."""
-    solver = mujoco_solver(model)
-    state, control = model.state(), model.control()
-    rates = state.joint_qd.numpy()
-    rates[0] = 3.0
-    state.joint_qd.assign(rates)
-    shank, reached = model.body_label.index("world_0/FL_inner_shank"), []
-    for _ in range(60):
-        solver.step(state, state, control, None, DT)
-        pose = state.body_q.numpy()[shank].astype(float)
-        reached.append(pose[0] + Rotation.from_quat(pose[3:]).apply([0.0, 0.0, -0.3])[0] + 0.025)
-    return max(reached)
-
-
-def test_obstacle_stops_the_paws_on_mujoco():
-    free, stopped = (build_model(1, friction=0.1, visuals=False, device="cpu", extras=e) for e in (None, wall))
-    assert farthest_paw(free) > 0.55
-    # the surface starts at x = 0.265 m, the wall at 0.45 m
-    assert farthest_paw(stopped) == pytest.approx(0.45, abs=0.02)

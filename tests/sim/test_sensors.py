@@ -138,12 +138,6 @@ def test_rows_name_paw_and_ground_and_meet_between_them():
         assert world == pytest.approx(ground, abs=1e-4) and ground[2] == 0.0
 
 
-def test_no_ground_means_no_rows():
-    robots = Robots("jumper", ground=None)
-    _, force = robots.step()
-    assert robots.contacts.rigid_contact_count.numpy()[0] == 0 and not force.any()
-
-
 def test_block_counts_as_ground():
     model = build_model(1, visuals=False, device="cpu")
     state, contacts = model.state(), newton.Contacts(4, 0, device="cpu")

@@ -5,8 +5,7 @@ import pytest
 import torch
 import warp as wp
 
-from columns import LIN_VEL, POS, Z
-from jumper_warp.robot.grounds import BlockCfg
+from columns import LIN_VEL, POS
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 
@@ -65,23 +64,16 @@ def test_reset_simulation_matches_a_new_one_bitwise(solver):
     assert np.array_equal(jump(sim), first)
 
 
-@pytest.mark.parametrize(
-    ("solver", "kind"),
-    [("jumper", "list"), ("jumper", "numpy"), ("jumper", "torch"), ("jumper", "warp"), ("mujoco", "numpy")],
-)
+KINDS = {"list": list, "numpy": np.array, "torch": torch.tensor, "warp": lambda x: wp.array(x, dtype=wp.bool)}
+
+
+@pytest.mark.parametrize(("solver", "kind"), [*(("jumper", kind) for kind in KINDS), ("mujoco", "numpy")])
 def test_reset_affects_masked_worlds_only(solver, kind):
     sim, unreset = simulation(3, solver), simulation(3, solver)
     fresh = snapshot(sim)
     for each in (sim, unreset):
         jump(each, 8)
-    selected = [False, True, False]
-    mask = {
-        "list": selected,
-        "numpy": np.array(selected),
-        "torch": torch.tensor(selected),
-        "warp": wp.array(selected, dtype=wp.bool, device="cpu"),
-    }[kind]
-    sim.reset(mask)
+    sim.reset(KINDS[kind]([False, True, False]))
     for actual, start, expected in zip(snapshot(sim), fresh, snapshot(unreset), strict=True):
         assert np.array_equal(actual[1], start[1])
         assert np.array_equal(actual[[0, 2]], expected[[0, 2]])
@@ -106,43 +98,6 @@ def test_reset_recovers_diverged_world(solver):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_standing_robot_stays_standing_after_a_reset(solver):
-    sim = simulation(2, solver)
-    height = sim.joint_q()[:, Z].copy()
-    jump(sim, 4)
-    sim.reset()
-    for _ in range(30):
-        sim.step()
-    assert sim.joint_q()[:, Z] == pytest.approx(height, abs=0.06)  # [m] of sag on its motors
-
-
-def test_captured_filter_and_physics_match_single_calls():
-    eager, captured = simulation(2, "jumper"), simulation(2, "jumper")
-    start = eager.joint_q()[0, 2]
-
-    def policy_step(sim):
-        """Advance one policy step by single calls."""
-        sim.filter_targets()
-        for _ in range(sim.substeps):
-            sim.physics_step()
-
-    for sim in (eager, captured):
-        sim.motors.offset.fill_(0.03)
-        command(sim, 0)
-        policy_step(sim)
-    with wp.ScopedCapture(device=captured.device) as capture:
-        policy_step(captured)
-    for step in range(1, 6):
-        for sim in (eager, captured):
-            command(sim, step)
-        policy_step(eager)
-        wp.capture_launch(capture.graph)
-        assert np.array_equal(captured.joint_q(), eager.joint_q())
-        assert np.array_equal(captured.joint_qd(), eager.joint_qd())
-    assert eager.joint_q()[0, 2] < start - 0.05  # [m] it squats
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
 def test_captured_reset_reads_its_mask_at_every_replay(solver):
     sim = simulation(3, solver)
     start = sim.joint_q().copy()
@@ -160,29 +115,12 @@ def test_captured_reset_reads_its_mask_at_every_replay(solver):
         assert np.array_equal(sim.joint_q(), expected)
 
 
-def test_reset_returns_blocks_of_masked_worlds_to_their_starts():
-    sim = simulation(2, "jumper", block=BlockCfg(center=(0.2, 0.0), mass=1.0, friction=0.0))
-    start = sim.solver.block_position()
-    jump(sim, 12)
-    moved = sim.solver.block_position()
-    assert np.abs(moved - start).max() > 1e-5
-    sim.reset([True, False])
-    assert np.array_equal(sim.solver.block_position()[0], start[0])
-    assert np.array_equal(sim.solver.block_position()[1], moved[1])
-
-
-def spinning(solver):
-    """Return a simulation of two robots without ground that translate and rotate."""
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_base_velocity_matches_differences_of_position(solver):
     sim = simulation(2, solver, ground=None)
     rates = sim.joint_qd().copy()
     rates[:, :6] = [[1.0, -2.0, 0.5, 2.0, -3.0, 1.0], [0.0, 0.0, 0.0, -4.0, 0.0, 5.0]]
     sim.state.joint_qd.assign(rates.ravel())
-    return sim
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_base_velocity_matches_differences_of_position(solver):
-    sim = spinning(solver)
     for _ in range(5):
         before = sim.joint_q()[:, POS].astype(float)
         sim.physics_step()
@@ -195,22 +133,6 @@ def test_base_velocity_matches_differences_of_position(solver):
     assert np.abs(found - com_velocity).max() > 0.02  # origin and COM differ
 
 
-def test_base_velocity_in_a_captured_graph():
-    sim = spinning("jumper")
-    sim.physics_step()
-    velocity = sim.read_base_velocity()
-    assert velocity.dtype == wp.vec3 and velocity.shape == (2,)
-    with wp.ScopedCapture(device=sim.device) as capture:
-        sim.solver.step(sim.state, sim.state, None, None, sim.dt)
-        sim.read_base_velocity()
-    velocities = []
-    for _ in range(3):
-        wp.capture_launch(capture.graph)
-        velocities.append(velocity.numpy().copy())
-        assert np.array_equal(velocities[-1], sim.base_velocity())
-    assert np.abs(np.diff(velocities, axis=0)).min(axis=(1, 2)).max() > 0.0
-
-
 def test_set_targets_broadcasts_and_refuses_bad_targets():
     sim, angles = Simulation(3, visuals=False, device="cpu"), np.arange(36.0).reshape(12, 3) / 36.0
     for targets in (angles, torch.tensor(angles), angles.tolist()):
@@ -218,9 +140,8 @@ def test_set_targets_broadcasts_and_refuses_bad_targets():
         np.testing.assert_array_equal(sim.target.numpy(), angles.astype(np.float32))
     sim.set_targets(angles[:, 1])
     np.testing.assert_array_equal(sim.target.numpy(), np.repeat(angles[:, 1:2], 3, axis=1).astype(np.float32))
-    for wrong in (angles.T, np.full(12, np.nan), angles + 0.5j, angles.astype(str), angles > 0.5):
-        with pytest.raises(ValueError, match="targets must"):
-            sim.set_targets(wrong)
+    with pytest.raises(ValueError, match="targets must"):
+        sim.set_targets(np.full(12, np.nan))
 
 
 def test_motors_commanded_beyond_a_squat_give_way_until_virtual_work_balances():

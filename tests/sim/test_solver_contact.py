@@ -33,12 +33,8 @@ def standing():
     return sim
 
 
-def test_paw_forces_of_a_standing_robot_carry_its_weight(standing):
-    total = paw_forces(standing)[0].sum(axis=0)
-    assert total == pytest.approx([0.0, 0.0, WEIGHT], abs=1e-3 * WEIGHT)
-
-
-def test_standing_robot_creeps_less_than_a_millimetre_in_ten_seconds(standing):
+def test_standing_robot_carries_its_weight_and_creeps_less_than_a_millimetre_in_ten_seconds(standing):
+    assert paw_forces(standing)[0].sum(axis=0) == pytest.approx([0.0, 0.0, WEIGHT], abs=1e-3 * WEIGHT)
     base, paws = standing.joint_q()[0, :7].copy(), paw_centres(standing)[0]
     for _ in range(600):  # 10 s
         standing.step()
@@ -72,25 +68,6 @@ def test_contact_iteration_reaches_its_tolerance(standing):
         missed += np.count_nonzero(sim.solver.residual.numpy() > TOLERANCE)
     assert steps > 10000
     assert missed == 0
-
-
-def test_friction_never_accelerates_a_sliding_paw():
-    sim = simulation(64)
-    thrown(sim, seed=11, height=(0.3, 0.6), speed=2.0)
-    rng = np.random.default_rng(18)
-    lower, upper = np.radians([-50.0, -30.0, -30.0] * 4), np.radians([110.0, 140.0, 140.0] * 4)
-    slides = 0
-    for i in range(960):
-        if i % 32 == 0:
-            command(sim, rng.uniform(lower, upper, (64, 12)))
-            sim.filter_targets()
-        joint_q = sim.joint_q().copy()
-        sim.physics_step()
-        force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., XY]
-        sliding = (np.linalg.norm(slip, axis=-1) > 0.3) & (force[..., Z] > 20.0)  # [m/s], [N]
-        slides += sliding.sum()
-        assert ((force[..., XY] * slip).sum(axis=-1)[sliding] < 0.0).all()
-    assert slides > 10000
 
 
 def test_friction_opposes_sliding_at_mu_times_the_normal_force():
@@ -181,20 +158,6 @@ def test_flat_heightfield_matches_the_plane():
     difference = field.joint_q() - plane.joint_q()
     difference[:, 2] -= height
     assert np.abs(difference).max() < 1e-3  # [m], [rad]
-
-
-def test_robot_survives_a_drop_from_one_metre():
-    sim = simulation(1)
-    q = sim.joint_q().copy()
-    q[0, 2] += 1.0
-    write_state(sim, q)
-    peak = 0.0
-    for _ in range(180):
-        sim.step()
-        peak = max(peak, sim.peak_force.numpy()[0])
-    assert np.isfinite(sim.joint_q()).all()
-    assert sim.joint_q()[0, 2] == pytest.approx(0.36, abs=0.03)
-    assert peak > 5.0 * WEIGHT
 
 
 def worst_excess(sim, worlds=slice(None)):

@@ -5,17 +5,8 @@ import dataclasses
 import pytest
 
 from jumper_warp.registry import make_task
-from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
-from jumper_warp.tasks.jump.cfg import Level, cross_levels
 
-GOALS = (Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.3, 0.3)), Level((0.0, 0.0, 0.6), (0.0, 0.0, 0.9), (0.3, 0.3)))
 STARTS = ((0.22, 0.35), (0.22, 0.45))  # [m] base heights
-
-
-def test_cross_levels_repeats_all_starts_for_each_level_of_goals():
-    levels = cross_levels(GOALS, STARTS)
-    assert [level.goal_upper[2] for level in levels] == [0.6, 0.6, 0.9, 0.9]
-    assert [level.base_height for level in levels] == [*STARTS, *STARTS]
 
 
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "horizontal-jump-standing", "vertical-jump-mars"])
@@ -33,13 +24,3 @@ def test_goals_in_all_directions_are_elliptical_and_grow_with_the_level():
         reach > least
         for reach, least in zip(reaches[-1], (1.2, 0.8, 0.8), strict=True)  # [m] ahead, aside, back
     )
-
-
-@pytest.mark.parametrize("name", ["vertical-jump-mars", "horizontal-jump-mars"])
-def test_mars_has_its_gravity_full_torque_and_a_loose_variant_with_higher_goals(name):
-    task, loose = make_task(name), make_task(f"{name}-loose")
-    kind = task.motors.transversal
-    assert (task.gravity, kind.saturation, kind.kp) == (3.71, 24.8, 20.0)
-    assert task.command_filter.horizon == vertical_jump_filter().horizon and loose.command_filter == loose_filter()
-    axis, paper = (2, 3.1) if name.startswith("vertical") else (0, 3.9)  # z or x, [m]
-    assert loose.levels[-1].goal_upper[axis] > paper

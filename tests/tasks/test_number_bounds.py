@@ -3,38 +3,28 @@
 import numpy as np
 import pytest
 
-from hold_height import hold_height, near_goal
+from hold_height import hold_height
 from jumper_warp.envs.skill import TaskRuntime
-from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.kernels.mdp import parameters
+from jumper_warp.kernels.jump import rewards
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import RandomizationCfg
-from jumper_warp.tasks.terms import EventTerm, RewardTerm, TerminationTerm
+from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.utils.errors import InputError
 
 STEP_DT = 1.0 / 60.0
 OUTSIDE = [
     ("observations.actor", "height", "clip", -5.0, "clip must be in 1e-06 to 1e\\+06, got -5"),
-    ("observations.actor", "height", "noise", -1.0, "noise must be in 0 to 1000, got -1"),
     ("observations.critic", "height", "scale", 0.0, "scale must be in 1e-06 to 1e\\+06, got 0"),
     ("curriculum", "height_error", "promote_after", 0, "promote_after at least 1"),
-    ("curriculum", "height_error", "promote_after", 2.5, "promote_after at least 1 and a whole number"),
     ("curriculum", "height_error", "tolerance", -0.1, "tolerance must not be negative"),
     ("rewards", "near_goal", "width", 0.0, "'width' must be a width of 1e-06 to 1e\\+09, got 0.0"),
-    ("rewards", "near_goal", "width", -1.0, "'width' must be a width"),
-    ("rewards", "near_goal", "weight", "3", "'weight' must be a finite number"),
-    ("rewards", "near_goal", "weight", True, "'weight' must be a finite number"),
     ("events", "push", "interval_range_s.lower", 0.0, "interval_range_s must be .* above 0"),
     ("events", "push", "interval_range_s.upper", 0.1, "interval_range_s must be \\(lower, upper\\)"),
     ("events", "push", "probability", 1.5, "'probability' must be in 0 to 1"),
     ("events", "base_mass", "lower", -100.0, "range base_mass must be above -"),
-    ("events", "base_mass", "lower", -101.0, "range base_mass must be in -100 to 100 kg"),
     ("events", "link_mass", "lower", 0.0, "range link_mass must be above 0"),
     ("events", "gains", "kp_lower", 9.0, "range gains must rise, got"),
-    ("events", "friction", "dynamic_lower", -0.1, "range dynamic_friction must be in 0 to 10"),
     ("events", "action_latency", "upper", 0.2, "range latency must be in 0 to 100 ms, got 200"),
-    ("events", "observation_latency", "upper", 1.0e9, "range observation_latency must be in 0 to 100 ms"),
-    ("events", "joint_offset", "upper", 1.0, "range joint_offset must be in -30 to 30 deg"),
 ]
 
 
@@ -52,30 +42,19 @@ def test_a_parameter_has_the_same_bounds_in_a_term_and_while_an_environment_runs
         term.with_flat_numbers((term.flat_numbers | {key: value}).values())
 
 
-SQUAT = {"takeoff_height": 0.3, "floor": 0.15}
-DIVISIONS = [
-    (rewards.soft_impact, "limit", {"weight": 1.0}),
-    (rewards.landing_tilt, "angle", {"weight": 1.0}),
-    (rewards.squat, "acceleration", {"weight": 1.0, "std": 0.03, **SQUAT}),
-    (terminations.shallow_squat, "acceleration", {"tolerance": 0.04, **SQUAT}),
-]
-
-
-@pytest.mark.parametrize(("func", "name", "numbers"), DIVISIONS)
+@pytest.mark.parametrize(
+    ("func", "name", "numbers"),
+    [(rewards.soft_impact, "limit", {}), (rewards.landing_tilt, "angle", {}),
+     (rewards.squat, "acceleration", {"std": 0.03, "takeoff_height": 0.3, "floor": 0.15})],
+)  # fmt: skip
 def test_refuses_to_divide_by_zero(func, name, numbers):
-    kind = RewardTerm if "weight" in numbers else TerminationTerm
     with pytest.raises(InputError, match=f"'{name}' must be a width"):
-        kind(func, **numbers, **{name: 0.0})
+        RewardTerm(func, 1.0, **numbers, **{name: 0.0})
 
 
 def test_randomisation_at_the_ends_of_the_bounds_is_accepted():
     ranges = {"joint_offset": (-30.0, 30.0), "latency": (0.0, 100.0), "observation_latency": (0.0, 100.0)}
     assert len(RandomizationCfg(**ranges).events()) == 12
-
-
-def test_numbers_of_numpy_are_accepted():
-    assert RewardTerm(near_goal, np.float32(2.0), width=np.float64(0.5)).weight == 2.0
-    assert EventTerm(parameters.base_mass, lower=np.int64(0), upper=1.0).numbers["lower"] == 0
 
 
 def test_both_ends_of_a_range_can_be_moved_in_turn_also_after_a_state_was_loaded():

@@ -3,7 +3,7 @@ import threading
 import pytest
 import warp as wp
 
-from jumper_warp.utils.kernels import load_kernels, loading_kernels
+from jumper_warp.utils.kernels import load_kernels
 
 
 @wp.kernel(module="unique")
@@ -40,8 +40,3 @@ def test_a_device_is_initialised_before_other_threads_use_it(uses):
     load_kernels([(first_kernel, 256), (second_kernel, 256)], wp.get_device("cpu"))
     assert uses[0] == ("context", threading.main_thread())
     assert sum(use == "load" for use, _ in uses) == 2
-
-
-def test_the_block_of_loading_kernels_runs_on_an_initialised_device(uses):
-    with loading_kernels([(first_kernel, 256)], wp.get_device("cpu")):
-        assert ("context", threading.main_thread()) == uses[0]

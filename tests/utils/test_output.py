@@ -10,13 +10,6 @@ from jumper_warp.utils import output
 from jumper_warp.utils.metrics import MetricValue, unit_of
 
 
-def test_metrics_file_holds_the_given_metrics(tmp_path):
-    metrics = {"apex [m]": 1.075, "worlds": 4096, "method": "open loop", "passed": True, "gap": None, "list": [18.0, 1]}
-    path = output.write_metrics(tmp_path, metrics).path
-    assert path == tmp_path / "metrics.json"
-    assert output.read_values(tmp_path) == metrics
-
-
 def test_metrics_file_has_documented_layout(tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     rate = MetricValue(0.5, 4, (0.15, 0.85), "landed jumps")

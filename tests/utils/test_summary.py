@@ -1,7 +1,4 @@
-import json
-
 import numpy as np
-import pytest
 
 from jumper_warp.utils.metrics import MetricValue, mean, rate
 from jumper_warp.utils.output import write_metrics
@@ -18,31 +15,13 @@ METRICS = {
 PAPER = {"goal_reached_rate": 0.91, "apex_error_abs_mean_m": 0.04}
 
 
-@pytest.fixture
-def summary(tmp_path, capsys):
-    """Function that prints the summary of METRICS in a folder with some files, and returns its text and the folder."""
-
-    # keys: metrics to print; files: empty files in the folder; flags: of `PrintFlags`
-    def run(keys=tuple(METRICS)[:5], files=("a.png", "film.mp4", "jump.rrd", "notes.txt"), **flags):
-        report = write_metrics(tmp_path, METRICS, {"solver": "jumper"})
-        for name in files:
-            (tmp_path / name).touch()
-        print_summary(report, "200 jumps", keys, paper=PAPER, flags=PrintFlags(**flags), seconds=12.3)
-        return capsys.readouterr().out, tmp_path
-
-    return run
-
-
-def test_summary_has_main_metrics_in_words_with_units_beside_the_papers_values(summary):
-    lines = [line.split() for line in summary()[0].splitlines()]
+def test_summary_has_main_metrics_in_words_with_units_beside_the_papers_values(tmp_path, capsys):
+    report = write_metrics(tmp_path, METRICS, {"solver": "jumper"})
+    print_summary(report, "200 jumps", tuple(METRICS)[:5], paper=PAPER, flags=PrintFlags(), seconds=12.3)
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[:2] == [["200", "jumps"], ["value", "95", "%", "interval", "paper"]]
     assert lines[2][:5] == ["goal", "reached", "rate", "96.5", "%"] and lines[2][-1] == "91"
     assert lines[3] == "goal reached rate, 0.5 to 1.1 m 100 %".split()
     assert lines[4][:7] == "apex error, mean size 0.02 m".split() + ["0.01"] and lines[4][-1] == "0.04"
     assert lines[5] == ["apex,", "max", "undefined"]
     assert lines[6] == ["steps", "12,346", "1/s"]
-
-
-def test_json_prints_the_file_and_nothing_else(summary):
-    text, folder = summary(json=True)
-    assert json.loads(text) == json.loads((folder / "metrics.json").read_text())

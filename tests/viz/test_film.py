@@ -11,7 +11,6 @@ from columns import POS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.viz import film
 from jumper_warp.viz.film import drawn_poses, write_film
-from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.renderer import RayTracer
 
 SIZE = (96, 64)  # [px]
@@ -96,37 +95,11 @@ def test_robots_stay_in_view_of_the_default_camera(tmp_path, canvas):
     assert drawn.poses[0][1, 1] - drawn.poses[0][0, 1] == pytest.approx(1.0)  # [m] apart
 
 
-def test_film_of_chosen_worlds_shows_no_other(tmp_path, canvas):
-    goals = np.array([[[1.0, 0.0, 0.0]]] * 3)
-    places = np.stack([walk(1.0)] * 3, axis=1)
-    recording = box_recording(places, spacing=1.0, goals=goals, heights=np.array([0.6, 0.7, 0.8]))
-    write_film(recording, tmp_path / "two.webp", size=SIZE, ranks=[0, 2])
-    (drawn,) = canvas
-    assert {shape.body for shape in drawn.shapes} == {-1, 0, 2}
-    names = {shape.name for shape in drawn.shapes if shape.name != "shape"}
-    assert names == {"goal_0_0", "goal_2_0", "height_0", "height_2"}
-
-
-@pytest.mark.parametrize(
-    ("ranks", "message"),
-    [
-        ([-1], "rank must be in 0 to 0, got -1"),
-        ([1], "rank must be in 0 to 0, got 1"),
-        ([], "number of ranks"),
-        (0, "ranks must be a sequence of int"),
-        (["world_0"], "ranks must be a sequence of int"),
-    ],
-)
+@pytest.mark.parametrize(("ranks", "message"), [([-1], "rank must be in 0 to 0, got -1"), ([], "number of ranks")])
 def test_film_of_worlds_that_are_not_recorded_is_refused(tmp_path, canvas, ranks, message):
     with pytest.raises(InputError, match=message):
         write_film(box_recording(walk(1.0)), tmp_path / "walk.webp", size=SIZE, ranks=ranks)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("rank", [-1, 1])
-def test_picture_of_a_world_that_is_not_recorded_is_refused(tmp_path, rank):
-    with pytest.raises(InputError, match=f"rank must be in 0 to 0, got {rank}"):
-        write_picture(box_recording(walk(1.0)), tmp_path / "walk.png", rank=rank)
 
 
 @pytest.mark.parametrize("tracing", [False, True])

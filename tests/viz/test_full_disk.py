@@ -4,7 +4,6 @@ import pytest
 
 from box_robot import box_recording, walk
 from full_disk import full_disk
-from jumper_warp.robot.export import export_robot
 from jumper_warp.viz.film import write_film
 from jumper_warp.viz.rerun import write_rrd
 
@@ -24,13 +23,3 @@ def test_full_disk_is_an_error_about_the_file_and_leaves_nothing(tmp_path, name)
     with full_disk(300), pytest.raises(OSError) as caught:  # byte
         WRITERS[name](folder / name)
     assert caught.value.filename == str(folder / name) and not list(folder.iterdir())
-
-
-@pytest.mark.parametrize("kind", ["mjcf", "urdf", "usd"])
-def test_full_disk_while_the_robot_is_exported_names_the_new_file(tmp_path, kind):
-    if kind == "usd":
-        pytest.importorskip("pxr")
-    with full_disk(300), pytest.raises(OSError) as caught:  # byte
-        export_robot(kind, tmp_path)
-    assert caught.value.filename.startswith(str(tmp_path)) and caught.value.filename.endswith((".obj", ".usda"))
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -43,13 +43,6 @@ def test_sweep_shows_errors_and_the_open_loop_jump_as_an_error(drawn):
     np.testing.assert_allclose(np.sum(limit.get_xydata(), axis=1), 1.075)  # command + error [m]
 
 
-def test_sweep_marks_the_values_of_the_paper(drawn):
-    (axis,) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
-    np.testing.assert_allclose(axis.containers[0][0].get_xydata(), [(0.75, 0.0), (1.0, 0.01)])
-    means = [line.get_ydata()[0] for line in axis.lines if "paper, simulation" in line.get_label()]
-    assert means == [-0.04, 0.04]
-
-
 def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     error = np.random.default_rng(3).normal(0.0, 0.1, 4000)
     _, axis = plt.subplots()

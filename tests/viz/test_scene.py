@@ -24,9 +24,8 @@ def test_fitted_view_shows_all_points_and_no_nearer_view_does(direction, extent)
     points = np.random.default_rng(3).uniform(-0.5, 0.5, (40, 3)) * extent + [4.0, -2.0, 1.0]
     view = fit(points, np.array(direction), SIZE, 25.0)
     ahead = view.target - view.eye
-    assert (
-        np.cross(ahead, direction) == pytest.approx(0.0, abs=1e-6 * np.linalg.norm(ahead)) and ahead @ direction < 0.0
-    )
+    assert np.cross(ahead, direction) == pytest.approx(0.0, abs=1e-6 * np.linalg.norm(ahead))
+    assert ahead @ direction < 0.0
     assert out_of_view(points, view, view.eye) <= 1.0 + 1e-6
     assert out_of_view(points, view, view.eye + 0.03 * ahead) > 1.0
 

@@ -68,17 +68,6 @@ def test_mesh_shape_has_its_scale_pose_and_color():
     assert mesh.color == pytest.approx((0.2, 0.4, 0.6))
 
 
-def test_infinite_plane_becomes_a_checkered_square_of_20_m_facing_up():
-    light, dark = build(add_ground=lambda b: b.add_ground_plane(label="ground"))
-    assert (light.name, dark.name) == ("ground_light", "ground_dark")
-    assert light.body == dark.body == -1
-    assert len(light.triangles) == len(dark.triangles) == 40 * 40  # half of 40 x 40 fields, two triangles each
-    assert extent(light) == pytest.approx([20.0, 20.0, 0.0])
-    for fields in (light, dark):
-        assert fields.normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(fields.normals), 1)))
-        assert trimesh.Trimesh(fields.vertices, fields.triangles).area == pytest.approx(200.0, rel=1e-5)  # [m^2]
-
-
 def test_heightfield_has_its_heights_at_its_nodes_facing_up():
     heights = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]])  # rows follow y, columns x
     field = newton.Heightfield(data=heights, nrow=2, ncol=3, hx=3.0, hy=0.5)

@@ -55,14 +55,6 @@ def test_links_are_relative_to_the_followed_point(server, shapes):
     assert scene.links[0].name == "/link_0"  # below ROOT it would move with the ground
 
 
-def test_new_goals_replace_earlier_ones(server, shapes):
-    scene = ViserScene(server.scene, shapes)
-    scene.show_goals([np.zeros(3), np.ones(3)])
-    scene.show_goals([np.array([0.5, 0.0, 0.0])])
-    assert len(scene.marks) == 1
-    assert scene.marks[0].position[0] == 0.5
-
-
 def test_glb_has_linear_colors_and_the_surface(shapes):
     shape = next(shape for shape in shapes if shape.body == 0)
     loaded = trimesh.load(io.BytesIO(glb_of([shape])), file_type="glb")

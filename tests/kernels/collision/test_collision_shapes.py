@@ -41,21 +41,12 @@ def random_segments(count=4000):
     return start_a, start_a + step_a, start_b, start_b + step_b, rng.uniform(0.03, 0.2, (count, 3))
 
 
-def test_segment_distances_agree_with_coal():
+def test_segment_and_box_distances_agree_with_coal():
     cases = random_segments()
-    segments, _ = shape_distances(*cases)
-    for distance, start_a, end_a, start_b, end_b in zip(segments, *cases[:4], strict=True):
-        expected = coal_distance(capsule(start_a, end_a, 0.01), capsule(start_b, end_b, 0.01)) + 0.02  # less the radii
-        assert distance == pytest.approx(expected, abs=1e-5)
-
-
-def test_box_distances_agree_with_coal():
-    cases = random_segments()
-    starts, ends, _, _, halves = cases
-    _, boxes = shape_distances(*cases)
-    for distance, start, end, half in zip(boxes, starts, ends, halves, strict=True):
-        expected = coal_distance(capsule(start, end, 0.01), box(-half, half)) + 0.01  # less the radius
-        assert distance == pytest.approx(expected, abs=1e-5)
+    for segment, distance, start, end, *other, half in zip(*shape_distances(*cases), *cases, strict=True):
+        bar = capsule(start, end, 0.01)
+        assert segment == pytest.approx(coal_distance(bar, capsule(*other, 0.01)) + 0.02, abs=1e-5)  # less the radii
+        assert distance == pytest.approx(coal_distance(bar, box(-half, half)) + 0.01, abs=1e-5)  # less the radius
 
 
 @pytest.mark.parametrize(  # the other segment goes from (0, 0, 0) to (1, 0, 0); all [m]

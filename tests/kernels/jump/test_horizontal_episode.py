@@ -102,23 +102,18 @@ def set_landed(env, **fields):
         edit_coordinates(env, world, q={0: 0.1 * world, 1: -0.2 * world})
 
 
-def all_fields(env):
-    """Return the fields of `Env.task_arrays` and `episodes_of`."""
-    return env.task_arrays() | episodes_of(env)
+def goals_ahead(arrays):
+    """Return the vector from base to goal [m], ahead, to the left and 0, (worlds, 3); arrays: of `Env.task_arrays`."""
+    return to_yaw_frame((arrays["goal"] - arrays["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(arrays))
 
 
-@pytest.fixture(scope="module")
-def next_jump(env):
-    """Return the task arrays before and after the step in which the worlds NEXT_JUMP got another goal."""
+def test_a_next_jump_begins_at_its_step_in_its_worlds_only(env):
+    """It begins in stance at the robot's position, is commanded at once, and its goal is observed."""
     set_landed(env)
     edit_episodes(env, NEXT_JUMP, next_jump_step=13, level=np.arange(10) % 4 + 1)
     before = env.task_arrays()
     env.step(REST)
-    return before, env.task_arrays()
-
-
-def test_a_next_jump_begins_at_its_step_in_stance_at_the_robots_position(next_jump):
-    before, after = next_jump
+    after = env.task_arrays()
     np.testing.assert_array_equal(np.flatnonzero(after["phase"] == STANCE), NEXT_JUMP)
     assert not after["done"].any()
     np.testing.assert_array_equal(after["jumps"] - before["jumps"], np.isin(np.arange(N), NEXT_JUMP))
@@ -127,36 +122,13 @@ def test_a_next_jump_begins_at_its_step_in_stance_at_the_robots_position(next_ju
     np.testing.assert_array_equal(after["start"][NEXT_JUMP], after["base_pos"][NEXT_JUMP])
     np.testing.assert_array_equal(after["max_height"][NEXT_JUMP], after["base_pos"][NEXT_JUMP, 2])
     assert angle_between(after["heading"], yaw_of(after))[NEXT_JUMP].max() < 1e-5
-
-
-def test_a_next_jump_is_commanded_at_once(next_jump):
-    _, after = next_jump
     np.testing.assert_array_equal(after["steps"], np.arange(1, N + 1))
     np.testing.assert_array_equal(after["command_step"][NEXT_JUMP], after["steps"][NEXT_JUMP])
-
-
-def goal_ahead_and_left(arrays):
-    """Return the vector from base to goal [m], ahead and to the left, (worlds, 2)."""
-    return to_yaw_frame((arrays["goal"] - arrays["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(arrays))[:, :2]
-
-
-def test_the_goal_of_a_next_jump_is_observed_at_once(env):
-    set_landed(env)
-    edit_episodes(env, NEXT_JUMP, next_jump_step=13)
-    env.step(REST)
-    after = env.task_arrays()
-    assert (after["jumps"][NEXT_JUMP] == np.arange(N)[NEXT_JUMP] % 3 + 1).all()
-    np.testing.assert_allclose(env.obs[:, :2].numpy(), goal_ahead_and_left(after), atol=1e-5)
-
-
-def test_a_goal_of_env_command_is_observed_at_once_in_chosen_worlds_only(env):
-    set_landed(env)
-    env.step(REST)
-    before = env.obs.clone()
-    chosen = np.arange(N) % 2 == 0
-    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)), chosen)
-    np.testing.assert_allclose(env.obs[chosen, :2].numpy(), np.tile([0.7, -0.2], (N // 2, 1)), atol=1e-5)
-    assert torch.equal(env.obs[~chosen], before[~chosen])
+    np.testing.assert_allclose(env.obs[:, :2].numpy(), goals_ahead(after)[:, :2], atol=1e-5)
+    others = np.setdiff1d(np.arange(N), NEXT_JUMP)
+    for name in ("goal", "start", "heading", "command_step", "jumps", "next_jump_step"):
+        np.testing.assert_array_equal(after[name][others], before[name][others])
+    np.testing.assert_array_equal(after["phase_steps"][others], 13)
 
 
 def test_goals_of_next_jumps_cover_the_levels_box_ahead_of_the_robot(env):
@@ -166,7 +138,7 @@ def test_goals_of_next_jumps_cover_the_levels_box_ahead_of_the_robot(env):
         env.step(REST)
         after = env.task_arrays()
         assert (after["phase"] == STANCE).all()
-        ahead.append(to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after)))
+        ahead.append(goals_ahead(after))
         level.append(after["level"])
     ahead, level = np.concatenate(ahead), np.concatenate(level)
     for number in range(1, 5):
@@ -175,14 +147,6 @@ def test_goals_of_next_jumps_cover_the_levels_box_ahead_of_the_robot(env):
             lower, upper = box.goal_lower[axis], box.goal_upper[axis]
             assert here[:, axis].min() >= lower - 1e-5 and here[:, axis].max() <= upper + 1e-5
             assert np.ptp(here[:, axis]) > 0.85 * (upper - lower)
-
-
-def test_worlds_without_a_next_jump_keep_their_episode(next_jump):
-    before, after = next_jump
-    others = np.setdiff1d(np.arange(N), NEXT_JUMP)
-    for name in ("goal", "start", "heading", "command_step", "jumps", "next_jump_step"):
-        np.testing.assert_array_equal(after[name][others], before[name][others])
-    np.testing.assert_array_equal(after["phase_steps"][others], 13)
 
 
 def test_a_next_jump_changes_no_robot_state_and_only_the_observed_goal():
@@ -211,6 +175,19 @@ def test_a_third_jump_is_planned_with_next_jump_probability(env):
     assert (arrays["phase"] == STANCE).all() and not arrays["next_jump_step"].any()
 
 
+@pytest.mark.parametrize(
+    ("fields", "begins"),
+    [({"phase_steps": 11}, 0), ({"phase": STANCE}, 0), ({"phase": FLIGHT}, 0), ({"phase_steps": 20}, 1)],
+    ids=["before its step", "in stance", "in flight", "overdue"],
+)
+def test_a_next_jump_begins_from_its_step_on_after_landing(env, fields, begins):
+    set_landed(env, **({"next_jump_step": 13} | fields))
+    env.step(REST)
+    running = env.done.numpy() == 0.0
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][running], (np.arange(N) % 3 + begins)[running])
+    assert running.any() or not begins
+
+
 def test_an_episode_that_ends_in_the_step_of_a_next_jump_is_reset(env):
     set_landed(env, next_jump_step=60, phase_steps=59)
     env.step(REST)
@@ -218,74 +195,49 @@ def test_an_episode_that_ends_in_the_step_of_a_next_jump_is_reset(env):
     assert env.done.all() and not after["jumps"].any() and not after["steps"].any()
 
 
-@pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase": STANCE}, {"phase": FLIGHT}])
-def test_no_next_jump_before_its_step_or_in_another_phase(env, wait):
-    set_landed(env, **({"next_jump_step": 13} | wait))
+def test_a_goal_of_env_command_is_observed_at_once_in_chosen_worlds_only(env):
+    set_landed(env)
     env.step(REST)
-    running = env.done.numpy() == 0.0
-    np.testing.assert_array_equal(env.task_arrays()["jumps"][running], (np.arange(N) % 3)[running])
+    before = env.obs.clone()
+    chosen = np.arange(N) % 2 == 0
+    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)), chosen)
+    np.testing.assert_allclose(env.obs[chosen, :2].numpy(), np.tile([0.7, -0.2], (N // 2, 1)), atol=1e-5)
+    assert torch.equal(env.obs[~chosen], before[~chosen])
 
 
-def test_an_overdue_next_jump_begins(env):
-    set_landed(env, next_jump_step=13, phase_steps=20)
-    env.step(REST)
-    running = env.done.numpy() == 0.0
-    assert running.any()
-    np.testing.assert_array_equal(env.task_arrays()["jumps"][running], (np.arange(N) % 3 + 1)[running])
-
-
-def test_a_command_begins_a_jump_in_chosen_landed_worlds_only(env):
-    set_landed(env, steps=1 + np.arange(N))
+@pytest.mark.parametrize("first", [0, 1], ids=["before the first step", "later"])
+def test_a_command_begins_a_jump_in_chosen_landed_worlds_only(env, first):
+    """Before the first step it sets the goal of a standing robot too."""
+    set_landed(env, steps=first * (1 + np.arange(N)), jumps=0)
     phase = np.array([STANCE, FLIGHT, LANDED, LANDED])[np.arange(N) % 4]
     edit_episodes(env, phase=phase, idle_steps=3, apex_passed=1, touched_down=0)
     chosen = np.arange(N) % 8 < 6
     goals = np.stack([np.linspace(0.3, 1.5, N), np.linspace(-0.3, 0.3, N), np.zeros(N)], axis=1)
-    before, q, qd = all_fields(env), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
+    before, q, qd = env.task_arrays() | episodes_of(env), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
     env.command(goals, chosen)
-    after = all_fields(env)
-    begun = chosen & (phase == LANDED)
+    after = env.task_arrays() | episodes_of(env)
+    begun, stands = chosen & (phase == LANDED), chosen & (phase == STANCE) & (first == 0)
     assert 0 < begun.sum() < chosen.sum()
     for name in episodes_of(env):
-        np.testing.assert_array_equal(after[name][~begun], before[name][~begun], name)
-    offset = to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
-    np.testing.assert_allclose(offset[begun], goals[begun], atol=1e-5)
+        np.testing.assert_array_equal(after[name][~(begun | stands)], before[name][~(begun | stands)], name)
+    np.testing.assert_allclose(goals_ahead(after)[begun | stands], goals[begun | stands], atol=1e-5)
     assert (after["phase"][begun] == STANCE).all() and not after["phase_steps"][begun].any()
-    np.testing.assert_array_equal(after["command_step"][begun], after["steps"][begun])
-    np.testing.assert_array_equal(after["jumps"][begun], before["jumps"][begun] + 1)
+    np.testing.assert_array_equal(after["command_step"][begun | stands], after["steps"][begun | stands])
+    np.testing.assert_array_equal(after["jumps"], begun)
     np.testing.assert_array_equal(env.sim.joint_q(), q)
     np.testing.assert_array_equal(env.sim.joint_qd(), qd)
 
 
-def test_a_command_before_the_first_step_is_ignored_in_flight_and_begins_a_jump_after_landing(env):
-    set_landed(env)
-    phase = np.array([FLIGHT, LANDED])[np.arange(N) % 2]
-    edit_episodes(env, phase=phase, steps=0, jumps=0)
-    before = all_fields(env)
-    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
-    after = all_fields(env)
-    for name in episodes_of(env):
-        np.testing.assert_array_equal(after[name][phase == FLIGHT], before[name][phase == FLIGHT], name)
-    np.testing.assert_array_equal(after["jumps"], phase == LANDED)
-
-
-def test_a_command_before_the_first_step_sets_the_goal_of_a_standing_robot(env):
-    set_standing(env)
-    env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
-    after = env.task_arrays()
-    offset = to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
-    np.testing.assert_allclose(offset, np.tile([0.7, -0.2, 0.0], (N, 1)), atol=1e-5)
-    assert not after["command_step"].any() and not after["jumps"].any()
-
-
 @pytest.mark.parametrize(("miss", "near"), [(0.0, True), (0.095, True), (0.105, False), (0.4, False)])
 def test_a_jump_is_a_success_if_its_landing_error_is_within_a_tenth_of_a_metre(env, miss, near):
-    set_standing(env, level=1, streak=2)
+    set_standing(env, level=1, streak=4 * (np.arange(N) % 2))  # the fifth success in a row raises the level
     position = env.task_arrays()["base_pos"]
     edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + [0.6 * miss, -0.8 * miss, 0.0])  # ends at 60
     env.metrics()
     env.step(REST)
     assert ending_names(env) == ["success"] * N and (env.timeout == 1.0).all()
-    assert episodes_of(env)["streak"].tolist() == [3 if near else 0] * N
+    assert episodes_of(env)["streak"].tolist() == [int(near), 0] * (N // 2)
+    assert episodes_of(env)["level"].tolist() == [1, 1 + near] * (N // 2)
     metrics = env.metrics()
     assert metrics["Metrics/success"] == float(near)
     assert metrics["Metrics/error_of_successes_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)  # [m]
@@ -302,12 +254,3 @@ def test_other_terminations_at_the_goal_are_no_success(env, termination, episode
     env.step(REST)
     assert ending_names(env) == [termination] * N
     assert not episodes_of(env)["streak"].any() and env.metrics()["Metrics/success"] == 0.0
-
-
-def test_five_near_landings_raise_the_level_and_a_far_one_does_not(env):
-    set_standing(env, level=1, streak=4)
-    position = env.task_arrays()["base_pos"]
-    miss = np.where(np.arange(N) < 32, 0.05, 0.2)[:, None] * [1.0, 0.0, 0.0]  # [m] tolerance: 0.1
-    edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + miss)
-    env.step(REST)
-    assert env.task_arrays()["level"].tolist() == [2] * 32 + [1] * 32

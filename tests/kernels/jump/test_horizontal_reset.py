@@ -61,17 +61,12 @@ def test_start_modes_have_the_tasks_probabilities(env):
 
 
 @pytest.mark.parametrize("start_mode", START_MODES)
-def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
-    assert not starts[start_mode].flags.any()
+def test_no_state_collides_or_crosses_the_motor_limits_and_few_samples_are_invalid(starts, start_mode):
+    assert not starts[start_mode].flags.any() and (start_mode == "default" or starts[start_mode].fallbacks < 0.02)
     angles = starts[start_mode].q[:, MOTOR_COORDS].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 15.0 * DEG + 1e-4
     sums = angles[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
-
-
-@pytest.mark.parametrize("start_mode", [name for name in START_MODES if name != "default"])
-def test_the_default_pose_rarely_replaces_invalid_samples(starts, start_mode):
-    assert starts[start_mode].fallbacks < 0.02
 
 
 @pytest.mark.parametrize("start_mode", START_MODES)
@@ -197,12 +192,13 @@ def test_paws_of_a_push_rest_on_the_ground_around_the_start(starts):
     assert np.linalg.norm(sample.vel, axis=1).max() > 3.0  # [m/s] nearly a takeoff
 
 
-def test_paws_of_a_push_are_at_rest_while_the_base_moves(env):
-    begin_by(env, only("pushing", resets_of(env)))
+@pytest.mark.parametrize("start_mode", ["pushing", "after_landing"])
+def test_paws_on_the_ground_are_at_rest_while_the_base_moves(env, start_mode):
+    begin_by(env, only(start_mode, resets_of(env)))
     env.reset()
-    worlds = np.flatnonzero(episodes_of(env)["start_mode"] == START_MODES.index("pushing"))[:40]
+    worlds = np.flatnonzero(episodes_of(env)["start_mode"] == START_MODES.index(start_mode))[:40]
     _, velocities = paws_and_velocities(env, worlds)
-    assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
+    assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 0.9
 
 
 def test_start_modes_take_their_fractions_of_policy_steps_whatever_their_episode_length():

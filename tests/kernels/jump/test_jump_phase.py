@@ -1,3 +1,5 @@
+"""Phases of jumps and their apex by scripted motions, and the ballistic estimates by integration."""
+
 import itertools
 import math
 
@@ -5,13 +7,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jump_helpers import make_episode, make_view, tilted_by
+from jump_helpers import PHASES, make_episode, make_view, tilted_by
 from jumper_warp.kernels.jump import phase as jump_phase
 from jumper_warp.kernels.jump import rewards
 from jumper_warp.kernels.jump.phase import advance_jump
-from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE, JumpState
+from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 
+S, F, L = PHASES
 STEP = 1.0 / 60.0  # [s]
 G = 9.81  # [m/s^2]
 TAKEOFF_SPEED = 0.75  # [m/s]
@@ -20,12 +23,9 @@ HEIGHT = (0.1, 0.05, 0.4)  # [m] std_fine, scale_sharp, std_wide of `height_clos
 
 @wp.kernel(enable_backward=False)
 def advance_kernel(
-    views: wp.array(dtype=RobotView),
-    p: wp.array(dtype=float),
-    tasks: wp.array(dtype=JumpState),
-    height_reward: wp.array(dtype=float),
-    estimate: wp.array(dtype=float),
-):
+    views: wp.array(dtype=RobotView), p: wp.array(dtype=float), tasks: wp.array(dtype=JumpState),
+    height_reward: wp.array(dtype=float), estimate: wp.array(dtype=float),
+):  # fmt: skip
     """Advance an episode through all views; tasks: (views + 1,), initial state, then the state after each view."""
     for step in range(views.shape[0]):
         task = advance_jump(views[step], tasks[step], TAKEOFF_SPEED)
@@ -64,48 +64,66 @@ def jump_views(speed, z=0.4, end=0.3):
     return [*before, *views_of(contacts=0, up=speed - G * times, z=heights), *views_of(contacts=[4] * 5)]
 
 
-def test_a_flight_begins_without_contact_and_faster_than_the_takeoff_speed():
-    tasks, _, _ = advance(views_of(contacts=(4, 1, 0, 0, 0), up=(2.0, 2.0, 0.7, 0.8, 0.1)))
-    assert tasks["phase"].tolist() == [STANCE, STANCE, STANCE, FLIGHT, FLIGHT]
-    assert tasks["took_off"].tolist() == [0, 0, 0, 1, 0]
+HIGHEST = (0.15, 0.17, 0.18, 0.20, 0.23, 0.30, 0.35, 0.50, 0.55, 0.45, 0.30, 0.25)
+MOTIONS = {  # paws in contact, upward speeds [m/s], heights [m], first episode, fields after each step
+    "a flight begins without contact and faster than the takeoff speed": (
+        (4, 1, 0, 0, 0), (2.0, 2.0, 0.7, 0.8, 0.1), 0.3, {},
+        {"phase": [S, S, S, F, F], "took_off": [0, 0, 0, 1, 0]}),
+    "a flight ends with the first contact, and landed is final": (
+        (0, 0, 1, 0, 4), (2.0, -1.0, -2.0, 3.0, 0.0), 0.3, {},
+        {"phase": [F, F, L, L, L], "touched_down": [0, 0, 1, 0, 0]}),
+    # its contact breaks for two steps: the takeoff moves on with the contact
+    "contact while the base rises belongs to the push-off": (
+        (4, 0, 0, 2, 4, 2, 0, 0, 0, 0, 1, 4), (0.5, 1.0, 0.9, 1.3, 2.0, 2.6, 2.5, 1.2, -0.1, -1.5, -2.4, -1.0),
+        HIGHEST, {},
+        {"phase": [S] + 9 * [F] + 2 * [L], "touched_down": 10 * [0] + [1, 0], "at_apex": 8 * [0] + [1, 0, 0, 0],
+         "took_off": [0, 1, 0, 1, 1, 1] + 6 * [0], "phase_steps": [1, 0, 1, 0, 0, 0, 1, 2, 3, 4, 0, 1],
+         "max_height": [0.0, *HIGHEST[1:9], 0.55, 0.55, 0.55]}),
+    **{f"contact ends a flight at {speed} m/s": (
+        (0, 0, 1, 0), (2.0, 1.0, speed, 2.0), 0.3, {}, {"phase": [F, F, L, L]})
+       for speed in (TAKEOFF_SPEED - 0.01, 0.0, -1.0)},
+    "a paw that clips an edge on the way up does not end the flight": (
+        (0, 1, 0, 0, 2), (2.0, 0.8, 0.7, -1.0, -1.5), 0.3, {}, {"phase": [F, F, F, F, L]}),
+    "steps count in the episode and in the phase": (
+        (4, 0, 0, 2, 4), (0.0, 2.0, 1.0, -1.0, 0.0), 0.3, {},
+        {"steps": [1, 2, 3, 4, 5], "phase_steps": [1, 0, 1, 0, 1]}),
+    "touching down while rising is the apex": (
+        (0, 0, 2, 4), (3.0, 2.8, 0.7, 0.0), (0.5, 0.55, 0.6, 0.62), {},
+        {"at_apex": [0, 0, 1, 0], "max_height": [0.5, 0.55, 0.6, 0.6]}),
+    "an episode that begins past the apex has none": (
+        (0, 0, 4), (-1.0, -1.2, -0.5), (0.6, 0.5, 0.4), {"phase": F, "apex_passed": 1, "max_height": 0.8},
+        {"at_apex": [0, 0, 0], "max_height": [0.8] * 3}),
+    "heights before takeoff do not count": (
+        (4, 0, 0, 0), (0.0, 2.0, 1.8, -0.1), (0.9, 0.4, 0.43, 0.5), {}, {"max_height": [0.0, 0.4, 0.43, 0.5]}),
+    "idle steps are slow stance while a jump is commanded": (  # slow: below 0.1 m/s
+        (4, 4, 4, 4, 4, 0, 4), (0.0, 0.09, -0.09, 0.11, 0.0, 2.0, 0.0), 0.3, {"command_step": 2},
+        {"idle_steps": [0, 1, 2, 0, 1, 0, 0]}),
+    "the squat is the lowest height from the command to the takeoff": (
+        (4, 4, 4, 4, 4, 0, 4), (0.0,) * 5 + (2.0, 0.0), (0.20, 0.35, 0.30, 0.25, 0.28, 0.40, 0.22), {"command_step": 2},
+        {"squat": [0.20, 0.35, 0.30, 0.25, 0.25, 0.25, 0.25]}),
+}  # fmt: skip
 
 
-def test_a_flight_ends_with_the_first_contact_and_landed_is_final():
-    tasks, _, _ = advance(views_of(contacts=(0, 0, 1, 0, 4), up=(2.0, -1.0, -2.0, 3.0, 0.0)))
-    assert tasks["phase"].tolist() == [FLIGHT, FLIGHT, LANDED, LANDED, LANDED]
-    assert tasks["touched_down"].tolist() == [0, 0, 1, 0, 0]
-    np.testing.assert_allclose(tasks["touchdown_vel"][2:, 2], -1.0)  # [m/s] of the step before the contact
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_state_of_a_scripted_motion(motion):
+    *views, start, expected = MOTIONS[motion]
+    tasks, height_reward, _ = advance(views_of(*views), make_episode(**start))
+    for name, values in expected.items():
+        assert tasks[name].tolist() == pytest.approx(values), name
+    np.testing.assert_array_equal(height_reward > 0.0, tasks["at_apex"])
 
 
-def test_contact_while_the_base_rises_belongs_to_the_push_off():
-    # a push-off whose contact breaks for two steps: paws off the ground, on it again, takeoff, apex, touchdown
-    contacts = (4, 0, 0, 2, 4, 2, 0, 0, 0, 0, 1, 4)
-    up = (0.5, 1.0, 0.9, 1.3, 2.0, 2.6, 2.5, 1.2, -0.1, -1.5, -2.4, -1.0)
-    z = (0.15, 0.17, 0.18, 0.20, 0.23, 0.30, 0.35, 0.50, 0.55, 0.45, 0.30, 0.25)
-    tasks, height_reward, _ = advance(views_of(contacts, up, z))
-    assert tasks["phase"].tolist() == [STANCE] + 9 * [FLIGHT] + 2 * [LANDED]
-    assert np.flatnonzero(tasks["touched_down"]).tolist() == [10]
-    assert np.flatnonzero(tasks["took_off"]).tolist() == [1, 3, 4, 5]  # the takeoff moves on with the contact
-    assert tasks["phase_steps"][5:].tolist() == [0, 1, 2, 3, 4, 0, 1]
-    assert np.flatnonzero(tasks["at_apex"]).tolist() == np.flatnonzero(height_reward).tolist() == [8]
-    assert tasks["max_height"][-1] == pytest.approx(0.55)
-
-
-@pytest.mark.parametrize("speed", [TAKEOFF_SPEED - 0.01, 0.0, -1.0])
-def test_contact_ends_a_flight_unless_the_base_rises_faster_than_the_takeoff_speed(speed):
-    tasks, _, _ = advance(views_of(contacts=(0, 0, 1, 0), up=(2.0, 1.0, speed, 2.0)))
-    assert tasks["phase"].tolist() == [FLIGHT, FLIGHT, LANDED, LANDED]
-
-
-def test_a_paw_that_clips_an_edge_on_the_way_up_does_not_end_the_flight():
-    tasks, _, _ = advance(views_of(contacts=(0, 1, 0, 0, 2), up=(2.0, 0.8, 0.7, -1.0, -1.5)))
-    assert tasks["phase"].tolist() == [FLIGHT, FLIGHT, FLIGHT, FLIGHT, LANDED]
-
-
-def test_steps_count_in_the_episode_and_in_the_phase():
-    tasks, _, _ = advance(views_of(contacts=(4, 0, 0, 2, 4), up=(0.0, 2.0, 1.0, -1.0, 0.0)))
-    assert tasks["steps"].tolist() == [1, 2, 3, 4, 5]
-    assert tasks["phase_steps"].tolist() == [1, 0, 1, 0, 1]
+def test_states_read_velocity_tilt_and_contacts_since_touchdown():
+    views = views_of((0, 2, 4, 4), (2.0, -1.0, 0.0, 0.0))
+    down = [(0, 0, 0, 0), (1, 0, 0, 0), (1, 1, 0, 0), (0, 1, 1, 1)]  # FL, FR, BL, BR, by step
+    for view, tilt, paws in zip(views, (0.9, 0.1, 0.4, 0.0), down, strict=True):  # [rad]
+        view.projected_gravity = wp.vec3(*tilted_by(tilt)["projected_gravity"])
+        view.contact = wp.vec4(*map(float, paws))
+    tasks, _, _ = advance(views, make_episode(phase=F, apex_passed=1, paws_landed=0b1111))
+    assert tasks["phase"].tolist() == [F, L, L, L]
+    assert tasks["peak_tilt"].tolist() == pytest.approx([0.0, 0.1, 0.4, 0.4], abs=1e-3)
+    assert tasks["paws_landed"][1:].tolist() == [0b0001, 0b0011, 0b1111]
+    np.testing.assert_allclose(tasks["touchdown_vel"][1:, 2], 2.0)  # [m/s] of the step before the contact
 
 
 @pytest.mark.parametrize("speed", [1.0, 2.0, 3.7])
@@ -126,41 +144,6 @@ def test_apex_and_height_rewards_of_a_projectile(speed):
     np.testing.assert_allclose(estimate[2 : at_apex[0]], exact, rtol=1e-3)
 
 
-def test_touching_down_while_rising_pays_the_height_reached():
-    views = views_of(contacts=(0, 0, 2, 4), up=(3.0, 2.8, 0.7, 0.0), z=(0.5, 0.55, 0.6, 0.62))
-    tasks, height_reward, _ = advance(views)
-    assert tasks["at_apex"].tolist() == [0, 0, 1, 0]
-    assert tasks["max_height"][-1] == pytest.approx(0.6)
-    assert np.count_nonzero(height_reward) == 1
-
-
-def test_an_episode_that_begins_past_the_apex_is_not_paid_for_it():
-    falling = make_episode(phase=FLIGHT, apex_passed=1, max_height=0.8, goal=(0.0, 0.0, 0.8))
-    views = views_of(contacts=(0, 0, 4), up=(-1.0, -1.2, -0.5), z=(0.6, 0.5, 0.4))
-    tasks, height_reward, estimate = advance(views, falling)
-    assert not tasks["at_apex"].any() and not height_reward.any() and not estimate.any()
-    assert tasks["max_height"].tolist() == pytest.approx([0.8] * 3)
-
-
-def test_max_height_ignores_heights_before_takeoff():
-    tasks, _, _ = advance(views_of(contacts=(4, 0, 0, 0), up=(0.0, 2.0, 1.8, -0.1), z=(0.9, 0.4, 0.43, 0.5)))
-    assert tasks["max_height"][1:].tolist() == pytest.approx([0.4, 0.43, 0.5])
-
-
-def test_idle_steps_count_slow_stance_while_a_jump_is_commanded():
-    views = views_of(contacts=(4, 4, 4, 4, 4, 0, 4), up=(0.0, 0.09, -0.09, 0.11, 0.0, 2.0, 0.0))  # slow: below 0.1 m/s
-    tasks, _, _ = advance(views, make_episode(command_step=2))
-    assert tasks["idle_steps"].tolist() == [0, 1, 2, 0, 1, 0, 0]
-
-
-def test_peak_tilt_is_the_largest_tilt_since_touchdown():
-    views = views_of(contacts=(0, 2, 4, 4), up=(2.0, -1.0, 0.0, 0.0))
-    for view, tilt in zip(views, (0.9, 0.1, 0.4, 0.0), strict=True):  # [rad]
-        view.projected_gravity = wp.vec3(*tilted_by(tilt)["projected_gravity"])
-    tasks, _, _ = advance(views)
-    assert tasks["peak_tilt"].tolist() == pytest.approx([0.0, 0.1, 0.4, 0.4], abs=1e-3)
-
-
 def integrated_flight(pos, vel, height):
     """Return apex [m] and position (x, y) [m] at which a point mass falls through `height` [m]; steps of 0.1 ms."""
     pos, vel, dt, apex = np.array(pos), np.array(vel), 1.0e-4, pos[2]
@@ -175,36 +158,17 @@ def integrated_flight(pos, vel, height):
 
 @pytest.mark.parametrize(
     ("pos", "vel", "height"),
-    [
-        ((0.1, -0.2, 0.5), (1.5, -0.4, 3.0), 0.3),
-        ((0.0, 0.0, 0.8), (2.0, 0.3, -1.0), 0.3),
-        ((1.0, 0.0, 0.3), (1.0, 1.0, 2.5), 0.4),
-    ],
-)
+    [((0.1, -0.2, 0.5), (1.5, -0.4, 3.0), 0.3), ((0.0, 0.0, 0.8), (2.0, 0.3, -1.0), 0.3),
+     ((1.0, 0.0, 0.3), (1.0, 1.0, 2.5), 0.4)],
+)  # fmt: skip
 def test_the_ballistic_estimate_agrees_with_integration(pos, vel, height):
     apex, landing = integrated_flight(pos, vel, height)
     assert jump_phase.estimated_apex(wp.vec3(*pos), wp.vec3(*vel), G) == pytest.approx(apex, abs=1e-4)
-    landing = jump_phase.estimated_landing(wp.vec3(*pos), wp.vec3(*vel), height, G)
-    np.testing.assert_allclose(list(landing), landing, atol=1e-3)
+    estimate = jump_phase.estimated_landing(wp.vec3(*pos), wp.vec3(*vel), height, G)
+    np.testing.assert_allclose(list(estimate), landing, atol=1e-3)
 
 
 def test_the_estimate_of_a_projectile_that_falls_below_the_height_is_its_present_position():
     landing = jump_phase.estimated_landing(wp.vec3(0.5, 0.6, 0.2), wp.vec3(1.0, 1.0, -0.5), 0.3, G)
     np.testing.assert_allclose(list(landing), [0.5, 0.6], atol=1e-6)
     assert jump_phase.estimated_apex(wp.vec3(0.0, 0.0, 0.2), wp.vec3(0.0, 0.0, -5.0), G) == pytest.approx(0.2)
-
-
-def test_paws_landed_has_a_bit_for_each_paw_in_contact_since_touchdown():
-    down = [(0, 0, 0, 0), (1, 0, 0, 0), (1, 1, 0, 0), (0, 1, 0, 0), (0, 1, 1, 1)]  # of FL, FR, BL, BR, by step
-    views = [make_view(contacts=sum(paws), contact=np.array(paws, dtype=float)) for paws in down]
-    flying = make_episode(phase=FLIGHT, apex_passed=1, paws_landed=0b1111)
-    states, _, _ = advance(views, flying)
-    assert states["phase"].tolist() == [int(FLIGHT)] + 4 * [int(LANDED)]
-    assert states["paws_landed"][1:].tolist() == [0b0001, 0b0011, 0b0011, 0b1111]
-
-
-def test_the_squat_is_the_lowest_height_from_the_command_to_the_takeoff():
-    heights = (0.20, 0.35, 0.30, 0.25, 0.28, 0.40, 0.22)
-    views = views_of(contacts=(4, 4, 4, 4, 4, 0, 4), up=(0.0,) * 5 + (2.0, 0.0), z=heights)
-    tasks, _, _ = advance(views, make_episode(command_step=2))
-    assert tasks["squat"].tolist() == pytest.approx([0.20, 0.35, 0.30, 0.25, 0.25, 0.25, 0.25])

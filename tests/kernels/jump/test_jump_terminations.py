@@ -1,108 +1,100 @@
+"""Terminations of jumps by hand."""
+
 import pytest
+from scipy.spatial.transform import Rotation
 
-from jump_helpers import Table, functions, make_episode, make_view
+from jump_helpers import DEG, PHASES, Table
 from jumper_warp.kernels.jump import terminations
-from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
-NAMES = (
-    "landed_for wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff "
-    "shallow_squat crouched"
-)
-holds = Table(functions(terminations, NAMES), bool)
-"""holds(name, view, episode, **numbers): whether a termination holds."""
-
-
-def test_landed_for_holds_after_its_steps_since_touchdown():
-    for steps, over in ((59, False), (60, True)):
-        landed = make_episode(phase=LANDED, phase_steps=steps)
-        assert holds("landed_for", make_view(), landed, steps=60.0) is over
-    for phase in (STANCE, FLIGHT):
-        elsewhere = make_episode(phase=phase, phase_steps=200)
-        assert not holds("landed_for", make_view(), elsewhere, steps=60.0)
+S, F, L = PHASES
+GOAL = {"goal": (1.0, 2.0, 0.0)}
+RISING = {"pos": (0.2, 0.3, 0.52625), "lin_vel": (1.0, -0.6, 2.0)}  # lands 0.5 s later, 0.3 m high, at (0.7, 0)
+PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}  # [m], policy steps, [m]
+IDLE = {"steps": 180.0, "idle_steps": 60.0}
+SQUAT = {"tolerance": 0.04, "takeoff_height": 0.3, "acceleration": 50.0, "floor": 0.15}
+CROUCH = {"height": 0.28, "start_steps": 18.0, "landing_steps": 90.0}
+LOW, HIGH = {"pos": (0.0, 0.0, 0.27)}, {"pos": (0.0, 0.0, 0.29)}
+UP = {"contacts": 0, "lin_vel": (3.0, 0.0, 0.26)}
 
 
-@pytest.mark.parametrize(
-    ("error", "missed"), [(0.0, False), (0.09, False), (-0.09, False), (0.11, True), (-0.11, True)]
-)
-def test_wrong_height_counts_at_touchdown(error, missed):
-    fields = {"goal": (0.0, 0.0, 0.8), "max_height": 0.8 + error, "phase": LANDED}
-    assert holds("wrong_height", make_view(), make_episode(touched_down=1, **fields), tolerance=0.1) is missed
-    assert not holds("wrong_height", make_view(), make_episode(touched_down=0, **fields), tolerance=0.1)
+def at(event, rows):
+    """Return rows that hold in the step of an event only; event: field of the episode."""
+    return [(held and happens, robot, episode | {event: int(happens)})
+            for held, robot, episode in rows for happens in (True, False)]  # fmt: skip
 
 
-def test_low_touchdown_is_a_base_below_its_height_at_touchdown_only():
-    for z, low in ((0.21, False), (0.19, True)):
-        view = make_view(pos=(0.0, 0.0, z))
-        assert holds("low_touchdown", view, make_episode(touched_down=1), height=0.2) is low
-        assert not holds("low_touchdown", view, make_episode(touched_down=0), height=0.2)
+def impacts(limit, phase):
+    """Return rows of a base that falls at 1 m/s and changes its velocity by about `limit` [m/s^2] within a step."""
+    return [(hard, {"prev_lin_vel": (0.0, 0.0, -1.0), "lin_acc": (0.0, 0.0, acc),
+                    "lin_vel": (0.0, 0.0, -1.0 + acc / 60.0)}, {"phase": phase})
+            for acc, hard in ((limit - 0.1, False), (limit + 0.1, True), (-limit - 0.1, False))]  # fmt: skip
 
 
-def test_moved_away_is_measured_in_the_plane_from_the_start():
-    start = make_episode(start=(1.0, -1.0, 0.3))
-    assert not holds("moved_away", make_view(pos=(1.11, -0.85, 1.2)), start, distance=0.2)  # 0.186 m
-    assert holds("moved_away", make_view(pos=(1.13, -0.84, 0.3)), start, distance=0.2)  # 0.206 m
+def turned():
+    """Return rows of attitudes at touchdown, from headings across 180 degrees, with both signs of the quaternion."""
+    rows = []
+    for yaw, pitch, is_turned in (
+        (0.0, 0.0, False), (9.5, 0.0, False), (-9.5, 0.0, False), (10.5, 0.0, True), (-10.5, 0.0, True),
+        (0.0, 29.5, False), (0.0, 30.5, True), (180.0, 0.0, True),
+        (9.0, 29.0, True), (9.0, 28.0, False),  # neither alone, but 30.3 and 29.4 degrees together
+    ):  # fmt: skip
+        for heading in (0.0, 100.0, 175.0, 180.0, -175.0):
+            quat = Rotation.from_euler("ZYX", [heading + yaw, pitch, 0.0], degrees=True).as_quat()
+            rows += [(is_turned, {"quat": sign * quat}, {"phase": L, "heading": heading * DEG}) for sign in (1.0, -1.0)]
+    return rows
 
 
-def test_slanted_takeoff_is_a_horizontal_speed_above_its_limit_at_takeoff_only():
-    for vx, slanted in ((0.59, False), (0.61, True)):
-        view = make_view(lin_vel=(vx, -0.45, 3.0))  # 0.6, 0.45: 0.75 m/s
-        assert holds("slanted_takeoff", view, make_episode(phase=FLIGHT, took_off=1), speed=0.75) is slanted
-        assert not holds("slanted_takeoff", view, make_episode(phase=FLIGHT), speed=0.75)
+TERMS = [  # (term, numbers, rows (whether it holds, robot, episode), phases in which it can hold)
+    ("landed_for", {"steps": 60.0}, [(steps == 60, {}, {"phase_steps": steps}) for steps in (59, 60)], [L]),
+    ("wrong_height", {"tolerance": 0.1}, at("touched_down", [
+        (abs(error) > 0.1, {}, {"phase": L, "max_height": 0.8 + error, "goal": (0.0, 0.0, 0.8)})
+        for error in (0.0, 0.09, -0.09, 0.11, -0.11)])),
+    ("low_touchdown", {"height": 0.2}, at("touched_down", [
+        (z < 0.2, {"pos": (0.0, 0.0, z)}, {}) for z in (0.21, 0.19)])),
+    ("moved_away", {"distance": 0.2}, [  # in the plane
+        (False, {"pos": (1.11, -0.85, 1.2)}, {"start": (1.0, -1.0, 0.3)}),  # 0.186 m
+        (True, {"pos": (1.13, -0.84, 0.3)}, {"start": (1.0, -1.0, 0.3)})]),  # 0.206 m
+    ("left_stance", {"distance": 0.3}, [
+        (miss > 0.3, {"pos": (1.0 + 0.6 * miss, -1.0 - 0.8 * miss, 0.9)}, {"start": (1.0, -1.0, 0.3)})
+        for miss in (0.29, 0.31)], [S]),
+    ("slanted_takeoff", {"speed": 0.75}, at("took_off", [  # 0.6, 0.45: 0.75 m/s
+        (vx > 0.6, {"lin_vel": (vx, -0.45, 3.0)}, {"phase": F}) for vx in (0.59, 0.61)])),
+    ("hard_impact", {"stance": 25.0, "flight": 50.0}, [
+        *impacts(25.0, S), *impacts(50.0, F), *impacts(50.0, L),
+        # a landing that stops within a step: 3 m/s lost in 1/60 s
+        (True, {"prev_lin_vel": (0.0, 0.0, -3.0), "lin_acc": (0.0, 0.0, 180.0)}, {"phase": L, "touched_down": 1})]),
+    ("no_jump", IDLE, [(steps == 211, {}, {"steps": steps, "command_step": 30}) for steps in (210, 211)], [S]),
+    ("no_jump", IDLE, [(idle == 61, {}, {"steps": 100, "command_step": 30, "idle_steps": idle})
+                       for idle in (60, 61)], [S]),
+    ("no_jump", IDLE, [(False, {}, {"steps": 20, "command_step": 30, "idle_steps": 99})]),
+    ("early_takeoff", {}, at("took_off", [(steps == 29, {}, {"phase": F, "steps": steps, "command_step": 30})
+                                          for steps in (29, 30)])),
+    ("second_takeoff", {"speed": 0.25}, [(True, UP, {}), (False, UP | {"lin_vel": (3.0, 0.0, 0.24)}, {}),
+                                         (False, {"contacts": 1, "lin_vel": (3.0, 0.0, 2.0)}, {})], [L]),
+    ("shallow_squat", SQUAT, at("took_off", [  # wanted: 0.3 - 9.81 * 0.5 / 50 = 0.2019 m
+        (squat > 0.2419, {}, {"phase": F, "squat": squat, "goal": (0.0, 0.0, 0.8)}) for squat in (0.240, 0.243)])),
+    ("crouched", CROUCH, [
+        (True, LOW, {"steps": 19, "command_step": 60}), (False, HIGH, {"steps": 19, "command_step": 60}),
+        (False, LOW, {"steps": 18, "command_step": 60}),
+        (False, LOW, {"steps": 60, "command_step": 60}),  # it squats for the jump
+        (False, LOW, {"phase": L, "steps": 200, "phase_steps": 90}),
+        (True, LOW, {"phase": L, "steps": 200, "phase_steps": 91}),
+        (False, HIGH, {"phase": L, "steps": 200, "phase_steps": 91}), (False, LOW, {"phase": F, "phase_steps": 200})]),
+    ("missed_goal", {"tolerance": 0.5}, at("touched_down", [
+        (miss > 0.5, {"pos": (1.0 - 0.6 * miss, 2.0 + 0.8 * miss, 0.9)}, GOAL | {"phase": L})
+        for miss in (0.49, 0.51)])),
+    ("predicted_miss", PREDICTED, [  # decided once, 0.1 s after takeoff
+        (miss > 0.55 and steps == 6, RISING, {"phase_steps": steps, "goal": (0.7 + 0.6 * miss, -0.8 * miss, 0.0)})
+        for miss in (0.54, 0.56) for steps in range(12)], [F]),
+    ("predicted_miss", PREDICTED, [  # above the ground at the goal: half a second to 0.38 m
+        (miss > 0.55, {"pos": (0.2, 0.0, 0.60625), "lin_vel": (1.0, 0.0, 2.0)},
+         {"phase": F, "phase_steps": 6, "goal": (0.7 + miss, 0.0, 0.0), "goal_ground": 0.08})
+        for miss in (0.54, 0.56)]),
+    ("turned_touchdown", {"rotation": 30.0 * DEG, "yaw": 10.0 * DEG}, at("touched_down", turned())),
+]  # fmt: skip
+holds = Table([getattr(terminations, name) for name in dict.fromkeys(row[0] for row in TERMS)], bool)
 
 
-@pytest.mark.parametrize(
-    ("phase", "limit"), [(int(STANCE), 25.0), (int(FLIGHT), 50.0), (int(LANDED), 50.0)], ids=["stance", "air", "landed"]
-)
-def test_hard_impact_has_a_limit_for_stance_and_one_for_the_rest(phase, limit):
-    task = make_episode(phase=phase)
-    for acc, hard in ((limit - 0.1, False), (limit + 0.1, True), (-limit - 0.1, False)):
-        falling = make_view(
-            prev_lin_vel=(0.0, 0.0, -1.0), lin_acc=(0.0, 0.0, acc), lin_vel=(0.0, 0.0, -1.0 + acc / 60.0)
-        )
-        assert holds("hard_impact", falling, task, stance=25.0, flight=50.0) is hard
-
-
-def test_a_landing_that_stops_within_a_step_is_a_hard_impact():
-    # 3 m/s lost in 1/60 s: 180 m/s^2
-    stopped = make_view(prev_lin_vel=(0.0, 0.0, -3.0), lin_acc=(0.0, 0.0, 180.0))
-    assert holds("hard_impact", stopped, make_episode(phase=LANDED, touched_down=1), stance=25.0, flight=50.0)
-
-
-def test_no_jump_holds_in_stance_too_long_after_the_command_or_at_rest():
-    view, limits = make_view(), {"steps": 180.0, "idle_steps": 60.0}
-    assert not holds("no_jump", view, make_episode(steps=210, command_step=30), **limits)
-    assert holds("no_jump", view, make_episode(steps=211, command_step=30), **limits)
-    assert not holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=60), **limits)
-    assert holds("no_jump", view, make_episode(steps=100, command_step=30, idle_steps=61), **limits)
-    for phase in (FLIGHT, LANDED):
-        assert not holds("no_jump", view, make_episode(phase=phase, steps=999, idle_steps=99), **limits)
-    assert not holds("no_jump", view, make_episode(steps=20, command_step=30, idle_steps=99), **limits)
-
-
-def test_early_takeoff_is_a_takeoff_before_the_command_step():
-    jumped = {"phase": FLIGHT, "command_step": 30}
-    assert holds("early_takeoff", make_view(), make_episode(took_off=1, steps=29, **jumped))
-    assert not holds("early_takeoff", make_view(), make_episode(took_off=1, steps=30, **jumped))
-    assert not holds("early_takeoff", make_view(), make_episode(took_off=0, steps=29, **jumped))
-
-
-def test_shallow_squat_is_a_takeoff_from_above_the_wanted_squat():
-    numbers = {"tolerance": 0.04, "takeoff_height": 0.3, "acceleration": 50.0, "floor": 0.15}
-    for squat, shallow in ((0.240, False), (0.243, True)):  # wanted: 0.3 - 9.81 * 0.5 / 50 = 0.2019 m
-        fields = {"phase": FLIGHT, "squat": squat, "goal": (0.0, 0.0, 0.8)}
-        assert holds("shallow_squat", make_view(), make_episode(took_off=1, **fields), **numbers) is shallow
-        assert not holds("shallow_squat", make_view(), make_episode(took_off=0, **fields), **numbers)
-
-
-def test_crouched_holds_before_the_command_and_after_the_landing_once_the_time_to_stand_up_is_over():
-    numbers = {"height": 0.28, "start_steps": 18.0, "landing_steps": 90.0}
-    low, high = make_view(pos=(0.0, 0.0, 0.27)), make_view(pos=(0.0, 0.0, 0.29))
-    waiting = make_episode(steps=19, command_step=60)
-    assert holds("crouched", low, waiting, **numbers) and not holds("crouched", high, waiting, **numbers)
-    assert not holds("crouched", low, make_episode(steps=18, command_step=60), **numbers)
-    assert not holds("crouched", low, make_episode(steps=60, command_step=60), **numbers)  # it squats for the jump
-    for steps, ended in ((90, False), (91, True)):
-        landed = make_episode(phase=LANDED, steps=200, phase_steps=steps)
-        assert holds("crouched", low, landed, **numbers) is ended
-        assert not holds("crouched", high, landed, **numbers)
-    assert not holds("crouched", low, make_episode(phase=FLIGHT, phase_steps=200), **numbers)
+@pytest.mark.parametrize("row", TERMS, ids=lambda row: row[0])
+def test_termination_by_hand(row):
+    holds.check(*row)

@@ -83,14 +83,6 @@ def test_noise_changes_in_every_step_and_repeats_at_the_same_step_count(probe):
     np.testing.assert_array_equal(noise_of(probe), first)
 
 
-def test_terms_without_noise_are_exact_while_another_has_noise(probe):
-    probe.skill.set("observations.actor", "value", noise=1.0)
-    values, others = sequence(4)
-    policy, critic = observe_steps(probe, values, others)
-    np.testing.assert_array_equal(policy[..., 5], values)
-    np.testing.assert_array_equal(critic[..., 0], others)
-
-
 def test_history_shifts_by_one_frame_per_step_and_starts_filled_with_the_first_frame(probe):
     values, others = sequence(6)
     policy, critic = observe_steps(probe, values, others)
@@ -147,15 +139,6 @@ def test_a_delayed_term_is_interpolated_linearly_between_past_frames(probe):
         np.testing.assert_allclose(critic[:, world, 3], late, atol=2e-6)
         np.testing.assert_array_equal(critic[1:, world, 2], critic[:-1, world, 3])
     np.testing.assert_array_equal(policy[..., 5], values)  # others are not delayed
-
-
-def test_a_delay_of_whole_policy_steps_gives_past_frames_bitwise(probe):
-    probe.latency.assign(8 * (np.arange(N) % 7))
-    values, others = sequence(12)
-    policy, _ = observe_steps(probe, values, others)
-    for world in range(N):
-        frames = np.maximum(np.arange(12) - world % 7, 0)
-        np.testing.assert_array_equal(policy[:, world, 7], values[frames, world])
 
 
 def test_a_delayed_term_holds_nothing_of_the_previous_episode(probe):

@@ -21,6 +21,7 @@ NAMES = """base_mass link_mass com_shift armature motor_friction gains speed_lim
 observation_latency push""".split()
 FUNCS = [getattr(parameters, name) for name in NAMES]
 COUNTS = [len(func.input_types) - 2 for func in FUNCS]
+OTHER_DOFS = np.setdiff1d(np.arange(38), MOTOR_DOFS)
 MOTORS = ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset")
 FIXED = ("motors", "physics_dt", "skill", "paw_shapes", "zero_latency")
 CHANGEABLE = [
@@ -133,22 +134,50 @@ def check_inertias(robots, sample):
 
 
 MASS = ("body_mass", "body_inv_mass", "body_inertia", "body_inv_inertia")  # changed by mass events
+SPEEDS = ("motors.no_load_speed", "motors.cutoff_speed", "speed_ratio")
 
 
-def test_a_mass_is_added_to_the_base_only(robots, run_event):
-    sample = run_event("base_mass", -1.0, 2.0, only=MASS)
-    added = bodies(sample.body_mass) - bodies(robots.nominal["body_mass"])
-    assert is_uniform(added[:, 0], -1.0, 2.0) and not added[:, 1:].any()
-    np.testing.assert_array_equal(bodies(sample.body_inertia)[:, 1:], bodies(robots.nominal["body_inertia"])[:, 1:])
-    check_inertias(robots, sample)
+def ratio(name):
+    """Return a function of a sample to its values of a motor parameter over the nominal ones, (N, 12)."""
+    return lambda new, old: (getattr(new, name) / old[f"motors.{name}"]).T
 
 
-def test_each_leg_link_is_scaled_independently(robots, run_event):
-    sample = run_event("link_mass", 0.8, 1.2, only=MASS)
-    scale = bodies(sample.body_mass) / bodies(robots.nominal["body_mass"])
-    np.testing.assert_array_equal(scale[:, 0], 1.0)
-    assert is_uniform(scale[:, 1:], 0.8, 1.2) and is_uncorrelated(scale[:, 1:])
-    check_inertias(robots, sample)
+def offset(name, part=0):
+    """Return a function of a sample to its change of a body's values, (N, ...); part: index of the body."""
+    return lambda new, old: (bodies(getattr(new, name)) - bodies(old[name]))[:, part]
+
+
+SAMPLES = [  # event, its numbers, parameters that it changes, what it samples, range, others that stay nominal
+    ("base_mass", (-1.0, 2.0), MASS, offset("body_mass"), (-1.0, 2.0), offset("body_mass", slice(1, None))),
+    ("base_mass", (-1.0, 2.0), MASS, offset("body_mass"), (-1.0, 2.0), offset("body_inertia", slice(1, None))),
+    ("link_mass", (0.8, 1.2), MASS, lambda new, old: (bodies(new.body_mass) / bodies(old["body_mass"]))[:, 1:],
+     (0.8, 1.2), offset("body_mass")),
+    ("com_shift", (-0.03, 0.02), ("body_com",), offset("body_com"), (-0.03, 0.02), offset("body_com", slice(1, None))),
+    ("gains", (0.6, 0.7, 1.0, 1.0), ("gain_ratio", "motors.kp"), ratio("kp"), (0.6, 0.7),
+     lambda new, old: new.kd - old["motors.kd"]),
+    ("gains", (0.6, 1.4, 0.6, 1.4), ("gain_ratio", "motors.kp", "motors.kd"),
+     lambda new, old: np.hstack([ratio("kp")(new, old), ratio("kd")(new, old)]), (0.6, 1.4), None),
+    ("armature", (0.6, 1.4), ("joint_armature",), lambda new, old: (
+        dofs(new.joint_armature)[:, MOTOR_DOFS] / dofs(old["joint_armature"])[:, MOTOR_DOFS]), (0.6, 1.4),
+     lambda new, old: (dofs(new.joint_armature) - dofs(old["joint_armature"]))[:, OTHER_DOFS]),
+    ("motor_friction", (0.005, 0.04), ("joint_friction",), lambda new, old: dofs(new.joint_friction)[:, MOTOR_DOFS],
+     (0.005, 0.04), lambda new, old: (dofs(new.joint_friction) - dofs(old["joint_friction"]))[:, OTHER_DOFS]),
+    ("speed_limits", (0.8, 1.2, 0.8, 1.4), SPEEDS, ratio("no_load_speed"), (0.8, 1.2), None),
+    ("joint_offset", (-0.035, 0.02), ("motors.offset",), lambda new, old: new.offset.T, (-0.035, 0.02), None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("row", SAMPLES, ids=lambda row: row[0])
+def test_an_event_samples_uniform_independent_values_and_changes_nothing_else(robots, run_event, row):
+    name, numbers, only, sampled, (lower, upper), nominal = row
+    new = run_event(name, *numbers, only=only)
+    values = sampled(new, robots.nominal)
+    assert is_uniform(values, lower, upper) and (values.ndim == 1 or is_uncorrelated(values))
+    assert nominal is None or not nominal(new, robots.nominal).any()
+    if only == MASS:
+        check_inertias(robots, new)
+    if name == "gains":
+        np.testing.assert_allclose(ratio("kp")(new, robots.nominal).T, new.gain_ratio[..., 0], rtol=1e-6)
 
 
 def test_a_second_sample_starts_from_the_nominal_mass(robots, run_event):
@@ -157,67 +186,12 @@ def test_a_second_sample_starts_from_the_nominal_mass(robots, run_event):
     assert is_uniform(bodies(sample.body_mass)[:, 0] - robots.nominal["body_mass"][0], -1.0, -0.5)
 
 
-def test_the_bases_centre_of_mass_is_shifted_along_each_axis(robots, run_event):
-    sample = run_event("com_shift", -0.03, 0.02, only=("body_com",))
-    shift = bodies(sample.body_com) - bodies(robots.nominal["body_com"])
-    assert is_uniform(shift[:, 0], -0.03, 0.02) and is_uncorrelated(shift[:, 0]) and not shift[:, 1:].any()
-
-
-def test_kp_and_kd_have_separate_ranges(robots, run_event):
-    sample = run_event("gains", 0.6, 0.7, 1.0, 1.0, only=("gain_ratio", "motors.kp"))
-    assert is_uniform(sample.kp / robots.nominal["motors.kp"], 0.6, 0.7)
-    np.testing.assert_array_equal(sample.kd, robots.nominal["motors.kd"])
-
-
-def test_only_armatures_of_motors_are_scaled(robots, run_event):
-    sample = run_event("armature", 0.6, 1.4, only=("joint_armature",))
-    before, after = dofs(robots.nominal["joint_armature"]), dofs(sample.joint_armature)
-    motors = MOTOR_DOFS
-    scale = after[:, motors] / before[:, motors]
-    assert is_uniform(scale, 0.6, 1.4) and is_uncorrelated(scale)
-    others = np.setdiff1d(np.arange(38), motors)
-    np.testing.assert_array_equal(after[:, others], before[:, others])
-
-
-def test_only_motors_have_friction(robots, run_event):
-    sample = run_event("motor_friction", 0.005, 0.04, only=("joint_friction",))
-    motors = MOTOR_DOFS
-    values = dofs(sample.joint_friction)
-    assert is_uniform(values[:, motors], 0.005, 0.04) and is_uncorrelated(values[:, motors])
-    others = np.setdiff1d(np.arange(38), motors)
-    np.testing.assert_array_equal(values[:, others], dofs(robots.nominal["joint_friction"])[:, others])
-
-
-def test_gains_are_scaled_from_those_of_the_active_skill(robots, run_event):
-    sample = run_event("gains", 0.6, 1.4, 0.6, 1.4, only=("gain_ratio", "motors.kp", "motors.kd"))
-    ratio = np.concatenate([sample.kp / robots.nominal["motors.kp"], sample.kd / robots.nominal["motors.kd"]]).T
-    assert is_uniform(ratio, 0.6, 1.4) and is_uncorrelated(ratio)
-    np.testing.assert_allclose(
-        ratio, np.concatenate([sample.gain_ratio[..., 0], sample.gain_ratio[..., 1]]).T, rtol=1e-6
-    )
-    motors = [robots.tasks[world % 2].motors for world in range(N)]
-    for name in ("kp", "kd"):
-        lateral = [getattr(motor.lateral, name) for motor in motors]
-        np.testing.assert_array_equal(robots.nominal[f"motors.{name}"][0], np.float32(lateral))
-
-
-SPEEDS = ("motors.no_load_speed", "motors.cutoff_speed", "speed_ratio")
-
-
-def test_speed_limits_are_scaled_and_the_cutoff_stays_below_the_no_load_speed(robots, run_event):
+def test_the_cutoff_speed_stays_below_the_no_load_speed(robots, run_event):
     sample = run_event("speed_limits", 0.8, 1.2, 0.8, 1.4, only=SPEEDS)
-    no_load = sample.no_load_speed / robots.nominal["motors.no_load_speed"]
-    assert is_uniform(no_load, 0.8, 1.2) and is_uncorrelated(no_load.T)
     expected = sample.speed_ratio[..., 1] * robots.nominal["motors.cutoff_speed"]
     assert is_uniform(sample.speed_ratio[..., 1], 0.8, 1.4)
     np.testing.assert_allclose(sample.cutoff_speed, np.minimum(expected, 0.95 * sample.no_load_speed), rtol=1e-6)
-    bound = sample.cutoff_speed >= 0.9499 * sample.no_load_speed
-    assert 0.01 < bound.mean() < 0.9 and (sample.cutoff_speed <= 0.9501 * sample.no_load_speed).all()
-
-
-def test_sensor_offsets_are_uniform_and_independent(robots, run_event):
-    sample = run_event("joint_offset", -0.035, 0.02, only=("motors.offset",))
-    assert is_uniform(sample.offset, -0.035, 0.02) and is_uncorrelated(sample.offset.T)
+    assert 0.01 < np.mean(expected > 0.95 * sample.no_load_speed) < 0.9
 
 
 @pytest.mark.parametrize(("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.5)])
@@ -242,18 +216,11 @@ def test_a_latency_is_the_nearest_number_of_physics_steps(robots, run_event, nam
     fractions = np.bincount(sample, minlength=9) / N
     expected = np.array([0.5, *[1.0] * 7, 0.18]) / 7.68
     assert len(fractions) == 9 and np.abs(fractions - expected).max() < 4.5 * np.sqrt(0.13 * 0.87 / N)
+    for seconds in (*np.float32(np.arange(49) / 480.0), 0.0011, 0.1):
+        drawn = getattr(run_event(name, float(seconds), float(seconds), 0.0, only=(array_of,)), array_of)
+        assert (drawn == round(480.0 * float(seconds))).all(), seconds
     some = getattr(run_event(name, 0.004, 0.016, 0.3, only=(array_of,)), array_of)  # 1.92 steps at least, unless none
     assert np.mean(some == 0) == pytest.approx(0.3, abs=4.5 * np.sqrt(0.3 * 0.7 / N)) and some[some > 0].max() == 8
-
-
-@pytest.mark.parametrize("name", ["action_latency", "observation_latency"])
-def test_latencies_are_rounded_to_physics_steps_of_1_480_s(robots, run_event, name):
-    array_of = {"action_latency": "latency", "observation_latency": "observation_latency"}[name]
-    for steps in range(49):
-        seconds = float(np.float32(steps / 480.0))
-        assert (getattr(run_event(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
-    for seconds, steps in ((0.008, 4), (0.001, 0), (0.0011, 1), (0.0167, 8), (0.1, 48)):
-        assert (getattr(run_event(name, seconds, seconds, 0.0, only=(array_of,)), array_of) == steps).all(), steps
 
 
 def test_a_push_has_its_probability_and_uncorrelated_uniform_components(run_event):

@@ -9,7 +9,7 @@ import warp as wp
 
 from columns import XY
 from jump_helpers import Table, functions, make_view
-from jumper_warp.kernels.mdp.view import RobotView, mat43, vec12
+from jumper_warp.kernels.mdp.view import RobotView, mat43
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.tasks.velocity.flat import velocity_trot
@@ -17,9 +17,9 @@ from jumper_warp.tasks.velocity.paper import velocity_paper
 from jumper_warp.tasks.velocity.rough import velocity_rough
 from mdp_helpers import DEFAULT_ANGLE
 
-NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
-transversal_position air_time rapid_stepping clamped_rapid_stepping restless_stand foot_clearance slip touchdown
-torque_sign_changes trot_schedule shank_lean"""
+NAMES = """linear_velocity yaw_rate yaw_rate_on_course lin_vel_xy_l1 lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2
+standing_posture lateral_position transversal_position air_time rapid_stepping clamped_rapid_stepping restless_stand
+foot_clearance slip touchdown torque_sign_changes trot_schedule shank_lean"""
 reward = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
@@ -116,33 +116,32 @@ def offset(r):
     return r["angle"] - DEFAULT_ANGLE
 
 
+def error(r):
+    """Return velocity ahead, to the left [m/s] and yaw rate [rad/s] less the command (3,)."""
+    return np.array([*r["vel"][:2], r["ang_vel"][2]]) - r["command"]
+
+
 EXPECTED = {  # name of a reward: its numbers, and its value for the fields of a `Sample`
     "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
     "yaw_rate": ({"std": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
+    "yaw_rate_on_course": (
+        {"std": 0.5, "std_lin_vel": 1.5},
+        lambda r: np.exp(-4.0 * error(r)[2] ** 2 - np.sum(error(r)[:2] ** 2) / 2.25),
+    ),
+    "lin_vel_xy_l1": ({}, lambda r: np.linalg.norm(error(r)[:2])),
     "lin_vel_z_l2": ({}, lambda r: r["vel"][2] ** 2),
     "ang_vel_xy_l2": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
     "flat_orientation_l2": ({}, lambda r: np.sum(r["projected_gravity"][:2] ** 2)),
-    "standing_posture": (
-        {"std": 0.5, "shift": 0.2},
-        lambda r: np.exp(-np.mean((offset(r)[TRANSVERSAL] - 0.2) ** 2) / 0.25) * r["standing"],
-    ),
-    "lateral_position": (
-        {"steepness": 100.0},
-        lambda r: np.sum(np.exp(-100.0 * offset(r)[~TRANSVERSAL] ** 8) - 1.0),
-    ),
-    "transversal_position": (
-        {"steepness": 50.0, "shift": 0.2},
-        lambda r: np.sum(np.exp(-50.0 * (offset(r)[TRANSVERSAL] - 0.2) ** 20) - 1.0),
-    ),
-    "air_time": (
-        {"threshold": 0.25},
-        lambda r: np.sum(r["first_contact"] * (r["air_time"] - 0.25)) * (1 - r["standing"]),
-    ),
+    "standing_posture": ({"std": 0.5, "shift": 0.2}, lambda r: (
+        np.exp(-np.mean((offset(r)[TRANSVERSAL] - 0.2) ** 2) / 0.25) * r["standing"])),
+    "lateral_position": ({"steepness": 100.0}, lambda r: np.sum(np.exp(-100.0 * offset(r)[~TRANSVERSAL] ** 8) - 1.0)),
+    "transversal_position": ({"steepness": 50.0, "shift": 0.2}, lambda r: (
+        np.sum(np.exp(-50.0 * (offset(r)[TRANSVERSAL] - 0.2) ** 20) - 1.0))),
+    "air_time": ({"threshold": 0.25}, lambda r: (
+        np.sum(r["first_contact"] * (r["air_time"] - 0.25)) * (1 - r["standing"]))),
     "rapid_stepping": ({"threshold": 2.0}, lambda r: np.sum(np.maximum(r["recent_steps"] - 2.0, 0.0))),
-    "clamped_rapid_stepping": (
-        {"threshold": 2.0, "limit": 5.0},
-        lambda r: min(np.sum(np.exp(np.maximum(r["recent_steps"] - 2.0, 0.0)) - 1.0), 5.0),
-    ),
+    "clamped_rapid_stepping": ({"threshold": 2.0, "limit": 5.0}, lambda r: (
+        min(np.sum(np.exp(np.maximum(r["recent_steps"] - 2.0, 0.0)) - 1.0), 5.0))),
     "restless_stand": ({}, lambda r: np.sum(1.0 - r["contact"]) * r["standing"]),
     "foot_clearance": ({"target_height": 0.07}, lambda r: clearance(r, 0.07)),
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, XY] ** 2, axis=1))),
@@ -177,10 +176,3 @@ def test_shank_lean_in_the_default_pose_is_that_of_the_geometry():
         8.0 * lean**2, rel=1e-5
     )
     assert reward("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
-
-
-def test_a_robot_at_rest_in_the_default_pose_gets_full_standing_rewards():
-    state = make_state(standing=1)
-    assert reward("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
-    assert reward("standing_posture", make_view(), state, std=0.1, shift=0.0) == pytest.approx(1.0)
-    assert vec12(*DEFAULT_ANGLE) == make_view().default_angle

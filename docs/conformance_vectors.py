@@ -1,6 +1,6 @@
 """Record the conformance vectors of policies again, after a policy has changed.
 
-    python tests/helpers/conformance_vectors.py vertical_jump horizontal_jump walking_flat
+    python -m docs.conformance_vectors vertical_jump horizontal_jump walking_flat
 
 It writes `assets/conformance/NAME.npz` for bundles and `NAME.json` for programs without NumPy.
 """

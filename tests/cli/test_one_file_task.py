@@ -24,7 +24,7 @@ from jumper_warp.utils.output import read_values
 from jumper_warp.viz.picture import compose
 from jumper_warp.viz.props import goal_shapes
 
-FILE = Path(__file__).parent / "helpers" / "go_to.py"
+FILE = Path(__file__).parents[1] / "helpers" / "go_to.py"
 TASK = ["--task-module", str(FILE)]
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -1,14 +1,16 @@
-"""The flag --robot applies a robot overlay to training, evaluation and play."""
+"""The flag --robot applies a robot overlay to training, evaluation and play; `jumper robot` makes folders of robots."""
 
 import json
 
 import pytest
 
-from jumper_warp.cli.main import main
+from jumper_warp.cli.main import UsageError, main
+from jumper_warp.cli.robot import run as robot
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.conditions import env_of_recipe
 from jumper_warp.evaluation.run import EvaluationArgs, torque_limit
 from jumper_warp.policies.policy import Policy
+from jumper_warp.robot.folder import read_robot
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.output import read_values
 
@@ -57,3 +59,17 @@ def test_training_uses_and_saves_the_overlay(overlay):
     saved = RobotOverlay.from_json(json.loads(json.dumps(env.config()))["robot"])
     assert base_mass(env) == pytest.approx(saved.values["base_mass"][0]) and saved.values["kp"][0] == 0.8
     assert saved.randomization == {"base_mass": (-0.1, 0.1)}
+
+
+def test_new_folder_of_a_robot_is_checked_and_drawn(tmp_path, capsys):
+    robot(["new", str(tmp_path / "mine"), "--from", "heavy"])
+    table = read_robot(tmp_path / "mine")
+    assert table["name"] == "mine" and table["front"]["thigh"]["value"] == 0.245
+    table["body"]["inertia"]["value"] = [0.1, 0.1, 0.9, 0.0, 0.0, 0.0]
+    (tmp_path / "mine" / "robot.json").write_text(json.dumps(table))
+    robot(["check", str(tmp_path / "mine"), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert "40.000 kg" in printed and "implausible: body: no body has mass" in printed
+    assert (tmp_path / "out" / "robot.png").is_file() and (tmp_path / "out" / "jump.rrd").is_file()
+    with pytest.raises(UsageError, match="exists"):
+        robot(["new", str(tmp_path / "mine")])
