@@ -22,7 +22,12 @@ from jumper_warp.utils.threads import available_threads
 
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
-MOST_SPLITS = 64  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
+MOST_SPLITS = 32  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
+LOSS_SPLITS = 4  # Splits of losses for each of a gradient's: sums of losses are small, and need more blocks
+GRADIENT_TILE, GRADIENT_ROWS, GRADIENT_WARPS, GRADIENT_STAGES = 128, 64, 8, 3
+"""Tile of a weight's gradient, samples in a pass, warps and pipeline stages of its kernel."""
+FORWARD_ROWS, FORWARD_WARPS = 64, 4  # Samples and warps of a block that evaluates a minibatch; twice the warps mirrored
+BACKWARD_ROWS, BACKWARD_WARPS = 64, 4  # Rows and warps of a block that backpropagates
 SPLIT_ROWS = 512  # Smallest number of samples in a split; shorter ones cost more for their partial sums than they save
 MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
@@ -115,9 +120,10 @@ class FusedModel:
         self.weights = torch.zeros(layout.size, dtype=dtype, device=device)
         self.splits = min(MOST_SPLITS, power_of_two(max(1, rows // SPLIT_ROWS)))
         """Number of splits of a minibatch."""
-        self.partial = torch.zeros(self.splits, layout.size, device=device)
-        """Sums over the splits of the samples, (splits, size of the layout)."""
-        networks = (self.weights, self.partial, rows)
+        self.loss_splits = LOSS_SPLITS * self.splits
+        self.partial = torch.zeros(self.loss_splits, layout.size, device=device)
+        """Sums over the splits of samples, (loss_splits, size of the layout), of which weights use `splits` rows."""
+        networks = (self.weights, self.partial[: self.splits], rows)
         self.actor = FusedNetwork(layout.actor, flat, *networks, mirrored=self.mirrored)
         self.critic = FusedNetwork(layout.critic, flat, *networks)
         self.mirror = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)]).to(device)
@@ -174,9 +180,10 @@ class FusedNetwork:
         """
         gather, block = index is not None, 32 if self._layers[0].inputs % 64 else 64
         if self._whole:
-            launch(kernels.network_forward, (blocks(rows, 64),), num_warps=8 if self._rows_per_sample == 2 else 4)(
+            bm, warps = (FORWARD_ROWS, FORWARD_WARPS) if gather else (64, 4)  # few samples act: small blocks fill a GPU
+            launch(kernels.network_forward, (blocks(rows, bm),), num_warps=warps * self._rows_per_sample)(
                 x, index if gather else x, self._weights, self._value, tuple(self._outputs), rows, self._places,
-                self._biases, self._padded, gather, 64, block,
+                self._biases, self._padded, gather, bm, block,
             )  # fmt: skip
             return self.output
         for i, (layer, place) in enumerate(zip(self._layers, self._places, strict=True)):
@@ -193,9 +200,10 @@ class FusedNetwork:
         """Backpropagate `grad_output`; write all parameters' gradients as partial sums; arguments: as in `forward`."""
         count, gradients, outputs = self._rows_per_sample * rows, tuple(self._gradients), tuple(self._outputs)
         if self._whole:
-            launch(kernels.network_backward, (blocks(count, 64),))(
-                gradients[::-1], self._weights, outputs[::-1], count, self._places[::-1], self._padded[::-1], 64
-            )
+            launch(kernels.network_backward, (blocks(count, BACKWARD_ROWS),), num_warps=BACKWARD_WARPS)(
+                gradients[::-1], self._weights, outputs[::-1], count, self._places[::-1], self._padded[::-1],
+                BACKWARD_ROWS,
+            )  # fmt: skip
         else:
             for i in reversed(range(1, len(self._layers))):
                 layer = self._layers[i]
@@ -205,10 +213,9 @@ class FusedNetwork:
                     layer.outputs, 128, bn, min(power_of_two(layer.outputs), 64),
                 )  # fmt: skip
         splits = len(self._partial)
-        launch(kernels.weight_gradients, (self._gradient_tiles[-1][1], splits))(
+        launch(kernels.weight_gradients, (self._gradient_tiles[-1][1], splits), GRADIENT_WARPS, GRADIENT_STAGES)(
             gradients, (x, *outputs[:-1]), index, self._partial, self._partial.stride(0), rows,
-            rows_per_split(rows, splits),
-            self._places, self._gradient_tiles, 64,
+            rows_per_split(rows, splits), self._places, self._gradient_tiles, GRADIENT_ROWS,
         )  # fmt: skip
 
 
@@ -229,7 +236,7 @@ def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]
     """
     tiles, count = [], 0
     for layer in layers:
-        bm, bn = (min(power_of_two(width), 128) for width in (layer.outputs, layer.inputs))
+        bm, bn = (min(power_of_two(width), GRADIENT_TILE) for width in (layer.outputs, layer.inputs))
         first, count = count, count + blocks(layer.outputs, bm) * blocks(layer.inputs, bn)
         tiles.append((first, count, bm, bn))
     return tuple(tiles)

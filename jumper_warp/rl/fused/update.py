@@ -117,8 +117,9 @@ class FusedUpdate:
         self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
         fused, gradient = self._fused, self._flat.all_reduced
         launch(sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
-            fused.partial, fused.layout.table, gradient, fused.partial.stride(0), len(gradient), fused.splits,
-            fused.mirrored, SUM_BLOCK,
+            fused.partial, fused.layout.table, gradient, fused.partial.stride(0), len(gradient), fused.layout.noise,
+            fused.layout.critic[0].weight, fused.layout.losses, fused.splits, fused.loss_splits, fused.mirrored,
+            SUM_BLOCK,
         )  # fmt: skip
 
     def _actor_gradient(self, samples: torch.Tensor) -> None:
@@ -126,10 +127,10 @@ class FusedUpdate:
         fused, rows = self._fused, len(samples)
         partial, layout, log_std = fused.partial, fused.layout, self._model.log_std
         output = fused.actor.forward(self._features, rows, samples)
-        launch(actor_loss, (fused.splits,), num_warps=8)(
+        launch(actor_loss, (fused.loss_splits,), num_warps=8)(
             output, fused.mirror, self._samples, self._samples.shape[1], samples, log_std,
             self._collector.rollout.log_std, self._entropy_coef, fused.actor.grad_output, partial[0, layout.noise :],
-            partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits), len(log_std),
+            partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.loss_splits), len(log_std),
             self._cfg.clip, fused.mirrored, fused.actor.width, LOSS_ROWS,
         )  # fmt: skip
         fused.actor.backward(self._features, rows, samples)
@@ -139,9 +140,9 @@ class FusedUpdate:
         fused, cfg, rows = self._fused, self._cfg, len(samples)
         partial, critic = fused.partial, fused.critic
         output = critic.forward(self._critic_features, rows, samples)
-        launch(critic_loss, (fused.splits,), num_warps=8)(
+        launch(critic_loss, (fused.loss_splits,), num_warps=8)(
             output, self._samples, self._samples.shape[1], samples, critic.grad_output,
-            partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits),
+            partial[0, fused.layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.loss_splits),
             len(self._model.log_std), cfg.clip, cfg.value_coef, cfg.clip_value, critic.width, LOSS_ROWS,
         )  # fmt: skip
         critic.backward(self._critic_features, rows, samples)

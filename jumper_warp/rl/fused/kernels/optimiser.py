@@ -15,17 +15,26 @@ LOG_BETA_2 = tl.constexpr(-0.0010005003335835335)
 
 
 @triton.jit
-def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr):
+def sum_partials(
+    partial, table, gradient, stride, total, noise, noise_end, losses, SPLITS: tl.constexpr, LOSS_SPLITS: tl.constexpr,
+    MIRROR: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
     """Add up the gradients of all parts (splits) of the samples in a fixed order; write the flat gradient (total,).
 
-    partial: (SPLITS, stride), the gradient of each split.
+    partial: (LOSS_SPLITS, stride), the gradient of each split. The kernels of losses, which write the entries from
+    `noise` to `noise_end` and from `losses` on, divide samples into LOSS_SPLITS parts, those of weights into SPLITS.
     table: (3, total) of `FusedLayout`, the entry that a parameter has in `partial`, that of its mirror image, the sign.
     """
     i = tl.program_id(0) * B + tl.arange(0, B)
-    place = partial + tl.load(table + i, mask=i < total, other=0)
+    entry = tl.load(table + i, mask=i < total, other=0)
+    place = partial + entry
     grad = tl.zeros((B,), tl.float32)
     for split in tl.static_range(SPLITS):
         grad += tl.load(place + split * stride)
+    from_loss = ((entry >= noise) & (entry < noise_end)) | (entry >= losses)
+    if tl.max(from_loss.to(tl.int32), 0) > 0:
+        for split in range(SPLITS, LOSS_SPLITS):
+            grad += tl.load(place + split * stride, mask=from_loss, other=0.0)
     if MIRROR:
         image = partial + tl.load(table + total + i, mask=i < total, other=0)
         mirrored = tl.zeros((B,), tl.float32)
