@@ -8,6 +8,7 @@ environment of several.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
 from jumper_warp.kernels.mdp.handover import NONE, make_handover_kernel, restore_task_kernel, set_skill_kernel
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
-from jumper_warp.kernels.mdp.parameters import motors_kernel
+from jumper_warp.kernels.mdp.parameters import motors_kernel, push
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
 from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.dynamics import WorldRange, check_worlds
@@ -109,6 +110,9 @@ class Stages(Uncopied):
             each.observations.latency = self.parameters.observation_latency
         settings = [each.settings_of_skill() for each in self.skills]
         self._settings = wp.array(settings, dtype=SkillSettings, device=device)
+        self._side_stream = wp.Stream(device) if device.is_cuda else None
+        due = [slot for task in tasks for slot in task.params.slots["events"] if slot.term.due_at(AT_STEP)]
+        self._only_pushes = all(slot.func is push for slot in due)
         self._action = wp.zeros((len(tasks), n, 12), dtype=float, device=device)
         self._all = wp.full(n, 1.0, dtype=float, device=device)
         self._moved = wp.zeros(n, dtype=int, device=device)
@@ -162,19 +166,36 @@ class Stages(Uncopied):
             stages[name]()
 
     def _apply_actions(self, part: WorldSlice) -> None:
-        """Convert actions to motor targets and wrenches, then run interval events."""
+        """Convert actions to motor targets and wrenches, then run interval events that the physics may read."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
-        self._events(part, AT_STEP, self._all)
+        if not self._only_pushes:
+            self._events(part, AT_STEP, self._all)
 
     def _advance_physics(self, part: WorldSlice) -> None:
-        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions.
+
+        Beside that it samples the pushes of the next step.
+        """
         delays = self.delays
+        if self._only_pushes:
+            with self._beside():
+                self._events(part, AT_STEP, self._all)
         self.sim.advance(
             self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
             worlds=WorldRange(part.first, part.count),
         )  # fmt: skip
         self._track(part)
+        self._join()
+
+    def _beside(self) -> AbstractContextManager[object]:
+        """Return a context whose launches run beside later ones until `_join`, on a GPU; both are independent."""
+        return wp.ScopedStream(self._side_stream) if self._side_stream else nullcontext()
+
+    def _join(self) -> None:
+        """Let later launches wait for those in `_beside`."""
+        if self._side_stream:
+            wp.get_stream(self.wp_device).wait_stream(self._side_stream)
 
     def _track(self, part: WorldSlice) -> None:
         """Update paw kinematics, contacts and collisions after the physics of a policy step."""
@@ -265,12 +286,14 @@ class Stages(Uncopied):
                      skill.timer, self.parameters], BLOCKS["event"], EVENT_BLOCKS,
                 )  # fmt: skip
             if any(slot.update_solver for slot in due.values()):
-                self.sim.dynamics.parameters_changed(mask, WorldRange(part.first, part.count))
+                with self._beside() if stage == AT_RESET else nullcontext():  # `_clear_history` joins
+                    self.sim.dynamics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
         """Clear actions, contacts, delays and the solver's warm start where mask is nonzero."""
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
+        self._join()
         self.sim.dynamics.after_reset(mask)
 
     def _clear_results(self, mask: wp.array) -> None:
