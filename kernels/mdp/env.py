@@ -64,6 +64,12 @@ class EpisodeArrays:
 
 
 @wp.func
+def valid(index: int) -> int:
+    """Return an index that is not negative; the compiler sees so, and leaves out the code for negative ones."""
+    return index & 0x7FFFFFFF
+
+
+@wp.func
 def launched_world(episode: EpisodeArrays, index: int) -> int:
     """Return the world of a launch's thread `index`, or -1 if it has none.
 

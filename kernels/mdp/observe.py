@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, RING, EpisodeArrays, launched_world
+from .env import BEGUN, COMMANDED, RING, EpisodeArrays, launched_world, valid
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .parameters import RobotParameters
@@ -132,6 +132,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         world = launched_world(episode, index)
         if world < 0 or episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
+        world = valid(world)
         finite = bool(True)
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:

@@ -14,7 +14,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings, launched_world
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings, launched_world, valid
 from .options import FAST, kernel_name
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import update_paw_kinematics
@@ -70,6 +70,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         world = launched_world(episode, index)
         if world < 0 or episode.skill[world] != skill:
             return
+        world = valid(world)
         begins = mask[world] != 0.0
         commanded = bool(False)
         if wp.static(due is not None):

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from . import terminations
-from .env import BEGUN, Counters, EpisodeArrays, launched_world
+from .env import BEGUN, Counters, EpisodeArrays, launched_world, valid
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .unroll import unrolled
@@ -109,6 +109,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         world = launched_world(episode, wp.tid())
         if world < 0 or episode.skill[world] != skill:
             return
+        world = valid(world)
         robot = load_view(arrays, ground, world)
         state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)])
 
