@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -109,8 +109,9 @@ class TaskRuntime:
                                     slot.clip, oldest + j, width, slot.history, delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
-        table = np.array(columns, dtype=np.int32).reshape(-1, len(ObservationColumn.vars))
-        self.columns = wp.array(table.T, dtype=int, device=self.device)
+        fields: Any = ObservationColumn.numpy_dtype()
+        table = np.array(columns, dtype=fields)
+        self.columns = wp.array(table, dtype=ObservationColumn, device=self.device)
         self.num_chunks = -(-sum(len(task.params.slots[f"observations.{group}"]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
         allocate(arrays, ("raw",), (len(columns), n), float, self.device)

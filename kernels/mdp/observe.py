@@ -59,29 +59,6 @@ class ObservationArrays:
 
 
 @wp.func
-def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
-    """Return the indices of one component of an observation (`ObservationColumn`), read from the table `columns`.
-
-    columns: (fields of `ObservationColumn`, components).
-    """
-    column = ObservationColumn()
-    column.raw = columns[0, component]
-    column.group = columns[1, component]
-    column.start = columns[2, component]
-    column.stride = columns[3, component]
-    column.noise = columns[4, component]
-    column.noise_limit = columns[5, component]
-    column.scale = columns[6, component]
-    column.clip = columns[7, component]
-    column.oldest = columns[8, component]
-    column.width = columns[9, component]
-    column.history = columns[10, component]
-    column.delayed = columns[11, component]
-    column.past = columns[12, component]
-    return column
-
-
-@wp.func
 def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)) -> bool:
     """Write the scalar value of an observation term in a world to out[row, world]; return whether it is finite."""
     out[row, world] = value
@@ -237,25 +214,27 @@ def postprocess(
 
     p: numbers of the task's terms. after_reset: as in `postprocess_obs_kernel`.
     """
-    value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
+    value = finite_or_zero(arrays.raw[valid(column.raw), m.world], m.diverged)
     if column.delayed != 0:
         value = delay_value(arrays, m, column.past, value)
-    noise = p[column.noise]
+    noise = p[valid(column.noise)]
     if noise > 0.0:
         rng = stream_at(m.step_key, m.purpose, m.world, OBSERVATION + column.group)
-        value += noise * wp.clamp(normal(rng, column.oldest), -p[column.noise_limit], p[column.noise_limit])
-    value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
+        limit = p[valid(column.noise_limit)]
+        value += noise * wp.clamp(normal(rng, column.oldest), -limit, limit)
+    clip = p[valid(column.clip)]
+    value = finite_or_zero(p[valid(column.scale)] * wp.clamp(value, -clip, clip), m.diverged)
     value = wp.clamp(value, -LIMIT, LIMIT)
-    i = column.start + m.world * column.stride + column.oldest
+    i = valid(column.start + m.world * column.stride + column.oldest)
     keep_frames = after_reset != 0 and m.history_reset == COMMANDED
     for _ in range(column.history - 1):
-        frame = arrays.now[i + wp.where(keep_frames, 0, column.width)]
+        frame = arrays.now[valid(i + wp.where(keep_frames, 0, column.width))]
         if m.diverged or m.history_reset == BEGUN:
             frame = value
         arrays.now[i] = frame
         if after_reset == 0:
             arrays.final[i] = frame
-        i += column.width
+        i = valid(i + column.width)
     arrays.now[i] = value
     if after_reset == 0:
         arrays.final[i] = value
@@ -266,7 +245,7 @@ def postprocess_obs_kernel(
     # in
     skill: int,
     episode: EpisodeArrays,
-    columns: wp.array2d(dtype=int),
+    columns: wp.array(dtype=ObservationColumn),
     p: wp.array(dtype=float),
     after_reset: int,
     # in, out
@@ -281,6 +260,6 @@ def postprocess_obs_kernel(
     world = launched_world(episode, index)
     if world < 0 or episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
         return
-    m = step_context(episode, arrays, world)
-    for component in range(lane, columns.shape[1], LANES):
-        postprocess(arrays, load_column(columns, component), p, m, after_reset)
+    m = step_context(episode, arrays, valid(world))
+    for component in range(lane, columns.shape[0], LANES):
+        postprocess(arrays, columns[valid(component)], p, m, after_reset)
