@@ -9,10 +9,11 @@ import warp as wp
 from ..actuation.command_filter import filter_leg
 from ..layout import BODIES
 from ..state import leg_coord, leg_dof, load_motors
-from .env import RING, Delays, EpisodeArrays, SkillSettings
+from .env import RING, Delays, EpisodeArrays, SkillSettings, valid
+from .options import FAST
 from .view import RobotArrays, base_quat, base_velocity
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(FAST)
 
 
 @wp.func
@@ -63,7 +64,8 @@ def action_kernel(
     and sets `bad_action` of its world. push: see `begin_policy_step`.
     """
     leg, world = wp.tid()
-    world += episode.first
+    leg = valid(leg)
+    world = valid(world + episode.first)
     skill = skills[episode.skill[world]]
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
     rates = load_motors(arrays.joint_qd, leg_dof(world, leg))

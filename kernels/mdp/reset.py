@@ -20,7 +20,7 @@ from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(FAST)
 
 
 @wp.func
