@@ -1,9 +1,11 @@
 """Images by OpenGL and by ray tracing, against pinhole optics."""
 
+import importlib
 import math
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 
 import numpy as np
@@ -41,6 +43,8 @@ def opengl():
     CI installs OpenGL and sets the variable. Any later failure is a fault of the renderer.
     """
     pyglet = pytest.importorskip("pyglet")
+    with suppress(ImportError):  # as in the renderer: its LLVM before that of Mesa
+        importlib.import_module("triton")
     pyglet.options["headless"] = True
     try:
         from pyglet.window import Window
