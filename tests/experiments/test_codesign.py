@@ -33,9 +33,9 @@ def test_gradients_by_lengths_stiffness_and_targets_match_differences():
         batch[name][(*entry, 1 + world)] += side * STEPS[name]
     for tensor in batch.values():
         tensor.requires_grad_()
-    jumps = leg_jumps.Jumps(1 + len(moves), EARTH, double=True, device="cpu", threads=1)
+    jumps = leg_jumps.Jumps(1 + len(moves), EARTH, 0.6, double=True, device="cpu", threads=1)
     jump = jumps(batch["targets"], batch["design"])
-    assert jump.trajectory.impulse[-40:, :, 0].abs().max() == 0.0, "the jump does not take off"
+    assert 0.2 < jump.distance[0] and jump.flight[0] < 8 * jumps.steps, "the jump does not end in the simulated time"
     for result in (jump.distance, jump.energy, jump.faults):
         found = torch.autograd.grad(result[0], list(batch.values()), retain_graph=True)
         for by, name in zip(found, batch, strict=True):
@@ -52,30 +52,27 @@ def test_parameters_are_those_of_the_robots_of_the_designs():
     robots = [leg_jumps.robot_of(design) for design in designs]
     model = build_model(2, description=robots, visuals=False, device="cpu")
     expected = Rollout(model, description=robots, double=True, threads=1)
-    jumps = leg_jumps.Jumps(2, EARTH, double=True, device="cpu", threads=1)
+    jumps = leg_jumps.Jumps(2, EARTH, 0.6, double=True, device="cpu", threads=1)
     found = jumps.parameters(torch.tensor(designs.T))
     table = expected.parameters["table"].numpy()
     np.testing.assert_allclose(found["table"].numpy(), table, rtol=2.0e-5, atol=1.0e-9)
     np.testing.assert_allclose(found["geometry"].numpy(), expected.geometry(), rtol=0.0, atol=1.0e-12)
-    q = expected.standing()[0]
-    np.testing.assert_allclose(jumps.depth(torch.tensor(q[7:]), torch.tensor(designs.T))[0], q[2], atol=1.0e-7)
+    q = torch.tensor(expected.standing()[0])
+    np.testing.assert_allclose(jumps.clearance(q, torch.tensor(designs.T))[0], 0.0, atol=1.0e-7)
 
 
-def test_design_and_jump_improve_together(tmp_path):
-    args = codesign.Args(
-        planets=("earth",), distances=(1.0,), legs=("both",), count=4, iterations=6, evolve=False, out=tmp_path,
-        device="cpu", threads=1,
-    )  # fmt: skip
+def test_simulations_confirm_the_optimised_jump(tmp_path):
+    args = codesign.Args(count=4, iterations=6, out=tmp_path, device="cpu", threads=1)
     values = codesign.main(args)
     assert read_values(tmp_path) == values
-    for name in ("nominal", "both_farthest", "both_least"):
-        key = f"earth_{name}"
-        robot = load_overlay(tmp_path / key).description
+    for name in ("nominal", "changed"):
+        robot = load_overlay(tmp_path / f"{name}.json").description
         leg = leg_dimensions(robot, "BR")
-        assert (leg.thigh, leg.shank) == pytest.approx((values[f"{key}_thigh_m"], values[f"{key}_shank_m"]))
-        assert robot.spring[0] == pytest.approx(values[f"{key}_stiffness_n_m"])
-        for one, other in (("jumper_", ""), ("mjcf_", "mujoco_")):
-            distances = [values[f"{key}_{solver}distance_m"] for solver in (one, other)]
-            assert distances[0] == pytest.approx(distances[1], abs=0.05) and distances[0] > 0.4
-    assert values["earth_nominal_thigh_m"] == pytest.approx(0.175)
+        assert (leg.thigh, leg.shank) == pytest.approx((values[f"{name}_thigh_m"], values[f"{name}_shank_m"]))
+        distance = values[f"{name}_distance_m"]
+        assert distance > 0.4
+        assert values[f"{name}_jumper_distance_m"] == pytest.approx(distance, abs=0.001)
+        assert values[f"{name}_jumper_energy_j"] == pytest.approx(values[f"{name}_energy_j"], rel=0.001)
+        assert values[f"{name}_mujoco_distance_m"] == pytest.approx(distance, abs=0.05)
+    assert values["nominal_thigh_m"] == pytest.approx(0.175)
     assert (tmp_path / "codesign.png").stat().st_size > 10_000
