@@ -1,10 +1,10 @@
 """Optimise the two lengths of the legs, a spring between the knees and the motor targets of a jump together.
 
-    python experiments/codesign.py --planet mars --aim least
+    python experiments/codesign.py --planet mars
 
-The nominal leg first jumps 1 m (Mars: 2 m) with the least electrical energy. A changed leg then jumps as far as possible
-with this energy, or this distance with the least energy. Gradients are those of the reverse pass. With `--cma`, CMA-ES
-solves the second problem with as many simulated jumps (package `cma`). All jumps are repeated in SolverJumper and
+The nominal leg first jumps 1 m (Mars: 2 m) with the least electrical energy. From these jumps, changed legs jump as far
+as possible with this energy, and this distance with the least energy. Gradients are those of the reverse pass. With
+`--cma`, CMA-ES does the same with as many simulated jumps (package `cma`). All jumps are repeated in SolverJumper and
 SolverMuJoCo. The script writes `metrics.json`, `codesign.png` and the robots, for
 `jumper train horizontal-jump --robot FILE`.
 
@@ -36,12 +36,13 @@ from support.leg_jumps import PUSH, STIFFEST, Jump, Jumps, overlay_of
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
 
 PLANETS = {"earth": (EARTH, 1.0), "mars": (MARS, 2.0)}  # Gravity [m/s^2], distance of the nominal leg's jump [m]
-KNOTS = 12  # Times of a jump between which targets are interpolated
+KNOTS = 20  # Times of a jump between which targets are interpolated
 TIME, SIZE = 0.5, 0.3  # Units of the unknowns of time and of the design; those of the targets are rad
 NOMINAL = (1.0, 1.0, 0.0), (1.0, 1.0, 0.0)
 CHANGED = (0.6, 0.6, 0.002), (1.4, 1.4, 1.0)
 """Least and largest thigh and shank in nominal lengths, and stiffness in `STIFFEST`."""
 SCREENED = 512  # Random jumps of which the best are the starts
+POPULATION = 16  # Jumps in an iteration of CMA-ES
 WORST = 1.0e6  # Cost of a jump with NaN
 
 
@@ -50,19 +51,23 @@ class Args(ThreadArgs):
     """Flags of the joint optimisation of leg and jump."""
 
     planet: Literal["earth", "mars"] = "earth"  # Planet to jump on
-    aim: Literal["farthest", "least"] = "farthest"  # Largest distance, or least energy
-    count: int = 16  # Number of jumps that are optimised in parallel
-    iterations: int = 150  # Number of iterations
+    count: int = 8  # Number of jumps that are optimised in parallel
+    iterations: int = 200  # Number of iterations
     rate: float = 0.1  # [rad] Largest change of a target in an iteration
     cma: bool = False  # Whether to compare with CMA-ES
-    spread: float = 0.1  # [rad] Initial standard deviation of CMA-ES
+    spread: float = 0.03  # [rad] Initial standard deviation of CMA-ES
     seed: int = 0  # Seed of the starts
 
 
-class Found(NamedTuple):
-    """Optimised jump."""
+def jumps_of(args: Args, count: int) -> Jumps:
+    """Return the simulation of a number of jumps on the planet of the flags."""
+    return Jumps(count, *PLANETS[args.planet], device=args.device, threads=args.threads)
 
-    unknowns: torch.Tensor  # (4 KNOTS + 5, 1)
+
+class Found(NamedTuple):
+    """Optimised jumps, the best one first."""
+
+    unknowns: torch.Tensor  # (4 KNOTS + 5, n)
     jumps: int  # Number of simulated jumps
     seconds: float  # [s] Processor time
 
@@ -83,25 +88,12 @@ def decode(unknowns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 class Problem:
     """Jump on a planet with the least cost, by a leg that may change within bounds."""
 
-    def __init__(self, args: Args, bounds: tuple, cost: Callable[[Jump], torch.Tensor]):
-        """Draw random jumps and legs, and keep the best as starts."""
-        self.args, self.score = args, cost
+    def __init__(self, args: Args, bounds: tuple, score: Callable[[Jump], torch.Tensor]):
+        """Build the simulation. bounds: of designs; score: cost of jumps (n,)."""
+        self.args, self.score = args, score
         self.begin = time.process_time()
-        rng = np.random.default_rng(args.seed)
-        gravity, distance = PLANETS[args.planet]
-        settings: Any = {"device": args.device, "threads": args.threads}
-        screened = Jumps(SCREENED, gravity, distance, **settings)
-        self.jumps = Jumps(args.count, gravity, distance, **settings)
-        self.low, self.high = (screened.tensor(bound)[:, None] / SIZE for bound in bounds)
-        lean = rng.uniform(0.0, 0.45, SCREENED) * np.array([[-1.0], [1.0], [1.0], [-1.0]])  # [rad]
-        squat, push = rng.uniform(1.2, 2.0, SCREENED), rng.uniform(-0.2, 0.2, SCREENED)  # [rad]
-        before = np.arange(KNOTS)[:, None, None] < rng.integers(KNOTS // 3, KNOTS - 2, SCREENED)
-        targets = (np.where(before, squat, push) + lean).reshape(4 * KNOTS, SCREENED)
-        design = rng.uniform([[0.7], [0.7], [0.0]], [[1.3], [1.3], [0.6]], (3, SCREENED)) / SIZE
-        unknowns = self.clip(screened.tensor(np.concatenate([targets, np.zeros((2, SCREENED)), design])))
-        with torch.no_grad():
-            best = self.cost(screened, unknowns).argsort()[: args.count]
-        self.starts = unknowns[:, best]
+        self.jumps = jumps_of(args, args.count)
+        self.low, self.high = (self.jumps.tensor(bound)[:, None] / SIZE for bound in bounds)
 
     def clip(self, unknowns: torch.Tensor) -> torch.Tensor:
         """Move designs into their bounds, and return the unknowns."""
@@ -112,14 +104,21 @@ class Problem:
         """Return the costs (n,) of jumps."""
         return self.score(jumps(*decode(unknowns))).nan_to_num(WORST)
 
-    def found(self, best: torch.Tensor) -> Found:
-        """Return the result of a search."""
-        jumps = SCREENED + self.args.count * self.args.iterations
-        return Found(best.detach().clone(), jumps, time.process_time() - self.begin)
+    def draw(self) -> torch.Tensor:
+        """Return the best of many random jumps, as starts; their legs are the smallest of the bounds."""
+        rng = np.random.default_rng(self.args.seed)
+        lean = rng.uniform(0.0, 0.45, SCREENED) * np.array([[-1.0], [1.0], [1.0], [-1.0]])  # [rad]
+        squat, push = rng.uniform(1.2, 2.0, SCREENED), rng.uniform(-0.2, 0.2, SCREENED)  # [rad]
+        before = np.arange(KNOTS)[:, None, None] < rng.integers(KNOTS // 3, KNOTS - KNOTS // 6, SCREENED)
+        targets = (np.where(before, squat, push) + lean).reshape(4 * KNOTS, SCREENED)
+        unknowns = self.clip(self.jumps.tensor(np.concatenate([targets, np.zeros((5, SCREENED))])))
+        with torch.no_grad():
+            best = self.cost(jumps_of(self.args, SCREENED), unknowns).argsort()
+        return unknowns[:, best[: self.args.count]]
 
-    def descend(self) -> Found:
+    def descend(self, starts: torch.Tensor) -> Found:
         """Minimise the cost by Adam with gradients of the reverse pass, in parallel from all starts."""
-        unknowns = self.starts.clone().requires_grad_()
+        unknowns = self.clip(starts.clone()).requires_grad_()
         adam = torch.optim.Adam([unknowns], self.args.rate, betas=(0.9, 0.99))
         rates = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.args.iterations)
         for _ in range(self.args.iterations):
@@ -130,29 +129,39 @@ class Problem:
             with torch.no_grad():
                 self.clip(unknowns)
         with torch.no_grad():
-            return self.found(unknowns[:, [int(self.cost(self.jumps, unknowns).argmin())]])
+            best = self.cost(self.jumps, unknowns).argsort()
+        return self.found(unknowns.detach()[:, best])
 
-    def evolve(self) -> Found:
-        """Minimise the cost by CMA-ES from the best start, with as many jumps."""
+    def evolve(self, starts: torch.Tensor) -> Found:
+        """Minimise the cost by CMA-ES from the first start, with as many jumps as `descend`."""
         cma: Any = importlib.import_module("cma")
-        options = {"popsize": self.args.count, "seed": 1 + self.args.seed, "verbose": -9}
-        search = cma.CMAEvolutionStrategy(self.starts[:, 0].numpy(), self.args.spread, options)
-        least, best = math.inf, self.starts[:, :1]
-        for _ in range(self.args.iterations):
+        jumps = jumps_of(self.args, POPULATION)
+        options = {"popsize": POPULATION, "seed": 1 + self.args.seed, "verbose": -9}
+        search = cma.CMAEvolutionStrategy(self.clip(starts.clone())[:, 0].numpy(), self.args.spread, options)
+        least, best = math.inf, starts
+        for _ in range(self.args.count * self.args.iterations // POPULATION):
             points = search.ask()
-            unknowns = self.clip(self.jumps.tensor(np.array(points).T))
+            unknowns = self.clip(jumps.tensor(np.array(points).T))
             with torch.no_grad():
-                cost = self.cost(self.jumps, unknowns)
+                cost = self.cost(jumps, unknowns)
             search.tell(points, cost.tolist())
             if cost.min() < least:
                 least, best = float(cost.min()), unknowns[:, [int(cost.argmin())]]
         return self.found(best)
 
+    def found(self, unknowns: torch.Tensor) -> Found:
+        """Return the result of a search."""
+        return Found(unknowns, self.args.count * self.args.iterations, time.process_time() - self.begin)
 
-def replay(solver: SolverName, design: np.ndarray, targets: np.ndarray, gravity: float, device: str | None) -> tuple:
-    """Return a robot's states (rows + 1, 19) and torques (rows, 12) on a solver; targets: filtered [rad] (rows, 12)."""
+
+def replay(solver: SolverName, design: np.ndarray, targets: np.ndarray, args: Args) -> tuple[np.ndarray, np.ndarray]:
+    """Return a robot's states (rows + 1, 19, 1) and torques (rows, 12, 1) on a solver.
+
+    targets: filtered ones of the physics steps [rad] (rows, 12).
+    """
+    gravity, _ = PLANETS[args.planet]
     sim = Simulation(
-        1, solver=solver, robot=overlay_of(design), gravity=gravity, substeps=1, visuals=False, device=device
+        1, solver=solver, robot=overlay_of(design), gravity=gravity, substeps=1, visuals=False, device=args.device
     )
 
     def state() -> np.ndarray:
@@ -165,12 +174,12 @@ def replay(solver: SolverName, design: np.ndarray, targets: np.ndarray, gravity:
         sim.step()
         states.append(state())
         torques.append(sim.torque.numpy()[:, 0].copy())
-    return np.array(states), np.array(torques)
+    return np.array(states)[..., None], np.array(torques)[..., None]
 
 
 def validate(found: Found, jumps: Jumps, name: str, args: Args, folder: Path) -> tuple[Json, torch.Tensor]:
     """Save a jump's robot, repeat the jump on two solvers, and return metrics and states until touchdown (rows, 19)."""
-    targets, design = decode(found.unknowns)
+    targets, design = decode(found.unknowns[:, :1])
     overlay_of(design[:, 0].tolist()).save(folder / f"{name}.json")
     with torch.no_grad():
         motion = jumps.simulate(targets, design)
@@ -183,13 +192,13 @@ def validate(found: Found, jumps: Jumps, name: str, args: Args, folder: Path) ->
     }  # fmt: skip
     commands = np.repeat(motion.filtered_target[..., 0].numpy(), SUBSTEPS, axis=0)
     solvers: tuple[SolverName, ...] = ("jumper", "mujoco")
-    runs = {f"{solver}_": replay(solver, design[:, 0].numpy(), commands, PLANETS[args.planet][0], args.device)
-            for solver in solvers}  # fmt: skip
-    ends = {"": jump} | {solver: jumps.measure(*(jumps.tensor(rows)[..., None] for rows in run), design)
-                         for solver, run in runs.items()}  # fmt: skip
-    for solver, end in ends.items():
-        values |= {f"{name}_{solver}distance_m": float(end.distance), f"{name}_{solver}energy_j": float(end.energy),
-                   f"{name}_{solver}pitch_deg": math.degrees(float(end.pitch))}  # fmt: skip
+    ends = {"": jump}
+    for solver in solvers:
+        states, torques = replay(solver, design[:, 0].numpy(), commands, args)
+        ends[f"{solver}_"] = jumps.measure(jumps.tensor(states), jumps.tensor(torques), design)
+    for run, end in ends.items():
+        values |= {f"{name}_{run}distance_m": float(end.distance), f"{name}_{run}energy_j": float(end.energy),
+                   f"{name}_{run}pitch_deg": math.degrees(float(end.pitch))}  # fmt: skip
     announce(f"{args.planet}, {name}: {float(jump.distance):.2f} m with {float(jump.energy):.0f} J")
     return values, motion.q[: int(jump.flight) + 1, :, 0]
 
@@ -198,8 +207,8 @@ def draw(axis: Any, jumps: Jumps, design: torch.Tensor, path: torch.Tensor, titl
     """Draw the base's path of a jump, and body and left legs at four instants; path: states (rows, 19)."""
     x, height = path[:, 0], path[:, 2]
     axis.plot(x, height, "--", color="C0")
-    top = int(height.argmax())
-    for shade, row in zip((0.3, 0.5, 0.75, 1.0), (0, int(height[:top].argmin()), top, len(path) - 1), strict=True):
+    rows = 0, int(height.argmin()), int(height.argmax()), len(path) - 1
+    for shade, row in zip((0.3, 0.5, 0.75, 1.0), rows, strict=True):
         outer, inner, paw = jumps.joints(path[row, 7:, None], design)[..., 0].unbind()
         zero = torch.zeros(4)
         chain = [[jumps.outer_hip[:, 0], zero], outer, paw, inner, [jumps.inner_hip[:, 0], zero]]
@@ -217,7 +226,7 @@ def main(args: Args) -> Json:
     torch.set_num_threads(1)
     folder = prepare("codesign", args, args.threads)
     gravity, distance = PLANETS[args.planet]
-    jumps = Jumps(1, gravity, distance, device=args.device)
+    jumps = jumps_of(args, 1)
     scale = load_description().mass * gravity * distance
 
     def least(jump: Jump) -> torch.Tensor:
@@ -227,21 +236,22 @@ def main(args: Args) -> Json:
         energy = values["nominal_energy_j"]
         return 6.0 * (jump.energy / energy - 1.0).clamp(min=0.0) - jump.distance / distance + 0.1 * jump.faults
 
-    results = {"nominal": Problem(args, NOMINAL, least).descend()}
+    problem = Problem(args, NOMINAL, least)
+    results = {"nominal": problem.descend(problem.draw())}
+    starts = results["nominal"].unknowns
     values, path = validate(results["nominal"], jumps, "nominal", args, folder)
     paths = {"nominal": path}
-    problem = Problem(args, CHANGED, least if args.aim == "least" else farthest)
-    results["changed"] = problem.descend()
-    if args.cma:
-        problem.begin = time.process_time()
-        results["cma"] = problem.evolve()
+    for aim, cost in (("farthest", farthest), ("least", least)):
+        results[aim] = Problem(args, CHANGED, cost).descend(starts)
+        if args.cma:
+            results[f"{aim}_cma"] = Problem(args, CHANGED, cost).evolve(starts)
     for name, found in list(results.items())[1:]:
         metrics, paths[name] = validate(found, jumps, name, args, folder)
         values |= metrics
     with figure(folder / "codesign.png", 2, 1, figsize=(9, 5.2), sharex=True, sharey=True) as axes:
-        for axis, name in zip(axes, ("nominal", "changed"), strict=True):
+        for axis, name in zip(axes, ("nominal", "farthest"), strict=True):
             title = f"{name} leg: {values[f'{name}_distance_m']:.2f} m with {values[f'{name}_energy_j']:.0f} J"
-            draw(axis, jumps, decode(results[name].unknowns)[1], paths[name], title)
+            draw(axis, jumps, decode(results[name].unknowns[:, :1])[1], paths[name], title)
         axes[-1].set_xlabel("x [m]")
     keys = [key for key in values if key.endswith(("distance_m", "energy_j"))]
     return report(args, folder, values, "Joint optimisation of leg and jump", keys)

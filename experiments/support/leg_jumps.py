@@ -69,7 +69,7 @@ class Jumps:
         distance [m]: of a typical jump, for which the simulated time is long enough.
         """
         self.real = torch.float64 if double else torch.float32
-        self.steps = PUSH + round(60.0 * 1.4 * math.sqrt(2.0 * distance / gravity))
+        self.steps = PUSH + round(60.0 * 1.3 * math.sqrt(2.0 * distance / gravity))
         motors = jumping_motors()
         common: Any = {"gravity": gravity, "visuals": False, "device": device, "mujoco": False}
         self.rollout = Rollout(

@@ -65,7 +65,7 @@ def test_simulations_confirm_the_optimised_jump(tmp_path):
     args = codesign.Args(count=4, iterations=6, out=tmp_path, device="cpu", threads=1)
     values = codesign.main(args)
     assert read_values(tmp_path) == values
-    for name in ("nominal", "changed"):
+    for name in ("nominal", "farthest", "least"):
         robot = load_overlay(tmp_path / f"{name}.json").description
         leg = leg_dimensions(robot, "BR")
         assert (leg.thigh, leg.shank) == pytest.approx((values[f"{name}_thigh_m"], values[f"{name}_shank_m"]))
