@@ -4,7 +4,7 @@
 
 Random jumps of the nominal leg are optimised for 1 m (Mars: 2 m) with the least electrical energy. As many iterations
 follow with the nominal leg, and from the same jumps with legs that change: as far as possible with the nominal leg's
-energy, and 1 m with the least energy. Gradients are those of the reverse pass. With `--cma`, CMA-ES changes the leg with
+energy, and 1 m with the least energy. Gradients are those of the reverse pass. With `--cma`, CMA-ES changes the legs by
 as many simulated jumps (package `cma`). All jumps are repeated in SolverJumper and SolverMuJoCo. The script writes
 `metrics.json`, `codesign.png` and the robots, for `jumper train horizontal-jump --robot FILE`.
 
