@@ -13,6 +13,8 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from jumper_warp import mdp
+from jumper_warp.cli.flags import field_docs
 from jumper_warp.registry import make_task
 from jumper_warp.robot.description import leg_dimensions, load_description
 from jumper_warp.robot.model import LIMIT_DAMPING, LIMIT_STIFFNESS, standing_configuration
@@ -23,7 +25,12 @@ from jumper_warp.tasks.randomization import MEAN_FRICTION, NOMINAL_FRICTION, Ran
 DOCS = Path(__file__).parent
 PAGES = tuple(
     DOCS / page
-    for page in ("reference/robot_parameters.md", "explanation/randomisation.md", "explanation/terms_and_kernels.md")
+    for page in (
+        "reference/robot_parameters.md",
+        "reference/mdp.md",
+        "explanation/randomisation.md",
+        "explanation/terms_and_kernels.md",
+    )
 )
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.DOTALL)
 TASKS = (
@@ -51,6 +58,8 @@ RANDOMISED = {
     "push_interval": ("time between samples of the push", "s"),
 }
 """Fields of `RandomizationCfg` in the table: meaning and unit."""
+FIELD = re.compile(r"(?:\[(?P<unit>.*?)\] )?(?P<meaning>.*?)(?:, (?P<frame>world|body axes|body to world))?")
+"""Comment of a field of `RobotView`: unit in brackets, meaning, frame."""
 
 
 def number(value: float, digits: int = 5) -> str:
@@ -208,7 +217,21 @@ def commands() -> str:
     return table("task | numbers of a row", grouped(lambda task: (str(task.command),)))
 
 
-TABLES = {each.__name__: each for each in (body, motors, passive, tasks, filters, randomisation, commands)}
+def robot_view() -> str:
+    """Return the fields of `RobotView`, in the order of the struct."""
+
+    def row(name: str, comment: str) -> tuple[str, ...]:
+        kind = mdp.RobotView.vars[name].type
+        shape = " × ".join(str(size) for size in getattr(kind, "_shape_", ())) or "1"
+        field = FIELD.fullmatch(comment)
+        assert field is not None
+        return f"`{name}`", shape, field["unit"] or "1", field["frame"] or "", field["meaning"]
+
+    docs = field_docs(mdp.RobotView.cls)
+    return table("field | shape | unit | frame | meaning", [row(name, docs[name]) for name in mdp.RobotView.vars])
+
+
+TABLES = {each.__name__: each for each in (body, motors, passive, tasks, filters, randomisation, commands, robot_view)}
 
 
 def updated(text: str) -> str:

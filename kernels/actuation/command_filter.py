@@ -1,9 +1,9 @@
 """Motor command filter (Olsen et al., Section III): limits targets more strictly as a joint nears its limit.
 
-It keeps motors off their stops and links off one another, whatever the policy commands, and leaves a target free while
-its joint is far from the limits. Angles are positive outward (lateral), and away from the leg's other thigh (outer,
-inner). A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With
-margins m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
+The filter keeps motors away from their stops and links away from each other, for any action of the policy. It does not
+change the target of a joint that is far from its limits. Angles are positive outward (lateral), and away from the leg's
+other thigh (outer, inner). A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits
+[lower, upper]. With margins m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
 
     t = min( m_u / max(x', v_0), m_l / max(-x', v_0) )
 
@@ -54,7 +54,7 @@ class FilterParams:
 def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
     """Return how strongly the filter enforces the limits of a motor angle or sum of angles, from 0 (not) to 1 (fully).
 
-    See the module for the rules. command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor
+    See the module for the rules. command, pos [rad], vel [rad/s] of the limited quantity; horizon [s], speed_floor
     [rad/s]: see `FilterParams`.
     """
     upper_margin = limits.upper - pos

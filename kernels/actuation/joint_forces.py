@@ -33,7 +33,7 @@ class JointParams:
 class JointForces:
     """Implicit passive forces of a leg in motor space: torque [N m], and matrix [kg m^2] that they add to the inertia.
 
-    torque is that at the current rates, the matrix is dt C.
+    The torque is taken at the current rates. The matrix is dt C.
     """
 
     torque: vec3
@@ -44,8 +44,8 @@ class JointForces:
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
     """Return damping coefficients [N m s/rad] equivalent to a leg's motor damping and friction at `rates` [rad/s].
 
-    A friction torque F at a rate w is the damping F / |w|, which the implicit step brings to rest without chatter. The
-    floor `FRICTION_SPEED` keeps it finite.
+    A friction torque F at a rate w acts as the damping F / |w|. The implicit step then ends at rest without chatter.
+    The floor `FRICTION_SPEED` keeps the damping finite.
     """
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
@@ -58,7 +58,7 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 def capped_damping(damping: real, rate: real, limit: real) -> real:
     """Return a damping coefficient [N m s/rad], reduced if its torque at `rate` [rad/s] would exceed `limit` [N m].
 
-    The knees' dampers saturate: with a constant coefficient they would take energy from a jump that the robot keeps.
+    The dampers of the knees saturate: with a constant coefficient, they would take too much energy from a jump.
     """
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 

@@ -71,8 +71,8 @@ def envelope(direction: real, vel: real, motor: MotorParams) -> real:
 def motor_torque(target: real, pos: real, vel: real, motor: MotorParams) -> real:
     """Return a motor's torque [N m] at the joint for a target [rad], the true position [rad] and speed [rad/s].
 
-    Position control, bounded by the torque-speed envelope; then over-speed protection fades driving and braking alike.
-    The controller only knows the sensor's reading, the true position plus `offset`.
+    The torque of the position control is bounded by the torque-speed envelope. Over-speed protection then reduces it,
+    in driving and in braking. The controller reads the true position plus `offset`, the error of the sensor.
     """
     command = motor.kp * (target - (pos + motor.offset)) - motor.kd * vel
     bounded = wp.clamp(command, -envelope(real(-1.0), vel, motor), envelope(real(1.0), vel, motor))

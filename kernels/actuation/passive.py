@@ -1,8 +1,8 @@
 """Explicit passive torques for Newton's SolverMuJoCo: capped knee damping, stops of outer + inner angle, springs.
 
-MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles, so these are added to its joint
-forces before each step. `SolverJumper` includes them, damping and stops implicitly (`joint_forces`, `stops`,
-`springs`).
+MuJoCo has neither a damper with a torque limit nor a stop for the sum of two angles. These torques are therefore added
+to its joint forces before each step. `SolverJumper` includes them, damping and stops implicitly (`joint_forces`,
+`stops`, `springs`).
 """
 
 import warp as wp
@@ -49,10 +49,11 @@ def passive_torque_kernel(
 ):
     """Apply every leg's passive torques [N m] to joint_f: knee damping, hard stops of outer + inner angle, and springs.
 
-    Those of the knees replace its entries, which no motor writes; the others are added to the motors' torques. One
-    thread per (world, leg). knee_damping [N m s/rad] acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of
-    outer + inner angle; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough for explicit integration. springs
-    (num_worlds,): stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
+    The torques of the knees replace the entries of joint_f, which no motor writes. The other torques are added to the
+    torques of the motors. One thread per (world, leg). knee_damping [N m s/rad] acts up to knee_limit [N m]. sum_lower,
+    sum_upper [rad]: stops of outer + inner angle; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough for
+    explicit integration. springs (num_worlds,): stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f:
+    Newton's, flat over worlds.
     """
     world, leg = wp.tid()
     q = world * COORDS + 7 + 5 * leg  # joints: lateral, outer motor, outer knee, inner motor, inner knee

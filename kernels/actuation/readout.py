@@ -37,7 +37,8 @@ def paw_force_kernel(
     """Copy the paws' contact forces [N] to shape (4, num_worlds) and update their peaks over time; thread per world.
 
     total_force (4 num_worlds,): a contact sensor's, paws FL, FR, BL, BR of each world. peak_paw_force (4, num_worlds)
-    is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 discards earlier peaks.
+    is the largest force on each paw, peak_force the largest sum of the four forces. restart != 0 discards earlier
+    peaks.
     """
     world = wp.tid()
     total = wp.vec3(0.0)
@@ -65,8 +66,8 @@ def arrived_target_kernel(
 ):
     """Write the target [rad] that each motor follows in physics step `step`, delayed by the latency of its world.
 
-    It is `previous` until `delay` [steps], then `target`. Launch over (12, num_worlds), the shape of all targets.
-    delay: (num_worlds,). step counts from the new target.
+    The motor follows `previous` for `delay` [steps], then `target`. Launch over (12, num_worlds), the shape of all
+    targets. delay: (num_worlds,). step counts from the new target.
     """
     motor, world = wp.tid()
     arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])

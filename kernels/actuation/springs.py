@@ -24,8 +24,8 @@ class LegSpring:
 def spring_torque(spring: LegSpring, loop: FiveBar) -> vec3:
     """Return the torques [N m] of a leg's spring on its motors: lateral (0), outer, inner.
 
-    They are the spring's force times the knees' velocities per motor rate. Positive opens the thighs: a stretched
-    spring gives negative torques.
+    The torques are the force of the spring times the velocities of the knees per motor rate. A positive torque opens
+    the thighs, so a stretched spring gives negative torques.
     """
     span = loop.outer_knee - loop.inner_knee
     length = wp.max(wp.length(span), real(1.0e-4))

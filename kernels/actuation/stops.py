@@ -1,4 +1,4 @@
-"""Hard stops of a leg: of each motor, and of the sum of outer and inner angle.
+"""Hard stops of a leg: stops of each motor, and of the sum of outer and inner angle.
 
 A stop is a spring with a damper on the penetration x = max(0, -gap), taken at the end of the step, that never pulls:
 
@@ -61,7 +61,7 @@ class StopRates:
 class StopForces:
     """Implicit forces of a leg's pressed hard stops: torque [N m], and matrix [kg m^2] that they add to the inertia.
 
-    torque is that at the current rates, the matrix is dt C.
+    The torque is taken at the current rates. The matrix is dt C.
     """
 
     torque: vec3
@@ -72,8 +72,8 @@ class StopForces:
 def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
     """Return the end-of-step motor rates beyond which hard stops exert torque in a step dt [s], from angles [rad].
 
-    They are the module's `goal`, of the rate s away from the lower stop, and minus it for the upper stop, where s is
-    minus the rate.
+    At the lower stop, the rate is `goal` of the module. At the upper stop it is minus `goal`, since s is then minus the
+    rate.
     """
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
@@ -139,8 +139,8 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
     """Return which hard stops of a leg to assume pressed in the next solution of a step, after `sets` solutions.
 
-    The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s]. From `PRESS_ONLY` sets on none is released, so that
-    the search ends.
+    The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s]. After `PRESS_ONLY` sets, no stop is released, so
+    that the search ends.
     """
     required = pressed_stops(stop_rates, rates, slack, pressed)
     if required == pressed or sets < PRESS_ONLY:
@@ -156,7 +156,8 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 def one_by_one(sets: int) -> bool:
     """Return whether only one hard stop per world may change in the next solution of a step, after `sets` of them.
 
-    Changing all stops at once is faster, but can cycle; changing one at a time cannot, without friction.
+    A change of all stops at once is faster, but the sets can cycle. Without friction, a change of one stop at a time
+    cannot cycle.
     """
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 

@@ -25,7 +25,7 @@ class TurnRanges:
 
 @wp.func
 def sample_unit_quat(rng: RngStream) -> wp.quat:
-    """Return a random orientation (xyzw), uniform over all (Shoemake 1992)."""
+    """Return a random orientation (xyzw), uniform over all orientations (Shoemake 1992)."""
     a = uniform(rng, streams.QUAT, 0.0, 1.0)
     b = uniform(rng, streams.QUAT + 1, 0.0, 2.0 * wp.pi)
     c = uniform(rng, streams.QUAT + 2, 0.0, 2.0 * wp.pi)

@@ -23,7 +23,7 @@ def turn_left(robot: RobotView, state: AttitudeState) -> wp.vec4:
 
 @wp.func
 def time_left(robot: RobotView, state: AttitudeState) -> float:
-    """Time until the end of the episode [s], with which the value of a state changes; 0 for an episode without end."""
+    """Time until the end of the episode [s]; 0 for an episode without end. The value of a state depends on it."""
     return float(wp.max(state.episode_steps - state.steps, 0)) / POLICY_RATE
 
 

@@ -14,7 +14,7 @@ from .state import POLICY_RATE, AttitudeState
 def approach(robot: RobotView, state: AttitudeState) -> float:
     """Reward for turning toward the goal orientation: decrease of the angle to it per second [rad/s].
 
-    Summed over an episode it is the angle gained, so turning back and forth pays nothing.
+    The sum over an episode is the decrease of the angle, so turning back and forth pays nothing.
     """
     return (state.old_error - state.error) * POLICY_RATE
 
@@ -29,8 +29,8 @@ def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
 def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
     """Reward for rest at the goal orientation: product of Gaussians phi of the angle to it and of the angular speed.
 
-    std [rad], std_ang_vel [rad/s]: their widths. The product demands rest only near the goal; far from it, the robot
-    must spin.
+    std [rad], std_ang_vel [rad/s]: their widths. Because of the product, the robot must rest only near the goal. Far
+    from the goal, it must rotate.
     """
     return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 

@@ -52,8 +52,8 @@ class AttitudeStart:
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
     """Return a copy of `start` for one sampling attempt; in the last attempt its legs are in the default pose.
 
-    The default pose is free of collisions, so that some attempt is valid. A `sample_base` of
-    `mdp.attempts.sample_valid_state`; arrays and rng are unused.
+    The default pose is free of collisions, so that some attempt is valid. `mdp.attempts.sample_valid_state` calls this
+    function as its `sample_base`; arrays and rng are unused.
     """
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
@@ -64,7 +64,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return motor angles of leg `leg`, default or sampled, with rates 0.
 
-    Sampled ones are marked as reachable if the sum of outer and inner angle is within its limits.
+    Sampled angles are marked as reachable if the sum of outer and inner angle is within its limits.
     """
     sample = LegSample()
     if base.default_legs:
@@ -88,8 +88,8 @@ def write_start(
 ):
     """Write a weightless start state with orientation `quat` (xyzw, body to world) to world `rng.world`.
 
-    The base origin is at rest above the world's origin while the body spins: the centre of mass, whose velocity Newton
-    stores, moves around it. `skill` holds the motors' limits.
+    The base origin is at rest above the origin of the world while the body rotates. The centre of mass, whose velocity
+    Newton stores, moves around the base origin. `skill` holds the motors' limits.
     """
     w = settings.spin
     start = AttitudeStart()

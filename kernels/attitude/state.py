@@ -49,7 +49,7 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
     """Return the task state with a new goal; quat, goal: present and goal orientation (xyzw, body to world).
 
-    `old_error` becomes the new error too, so that a change of the goal is not taken for a motion toward it.
+    `old_error` is also set to the new error, so that a change of the goal does not count as a motion toward it.
     """
     new = state
     new.goal = goal
@@ -79,8 +79,8 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 def carried_over(old: AttitudeState) -> AttitudeState:
     """Return a state for a new episode that keeps only the accumulated statistics of `old`, the previous state.
 
-    They include that episode if it was complete: its settling time is that of the first of the steps at its end that
-    were all within tolerance. The reset sets the other fields.
+    The statistics include the previous episode if it was complete. Its settling time is the time of the first step
+    after which the error stayed within tolerance. The reset sets the other fields.
     """
     new = AttitudeState()
     new.episodes = old.episodes

@@ -1,6 +1,6 @@
-"""Terminations of the attitude task; `mdp.terminations` has those of all tasks.
+"""Terminations of the attitude task; `mdp.terminations` has the terminations that all tasks share.
 
-The first term of a task that holds ends the episode: `ended_clear`, a success, precedes `ended`.
+The first true term of a task ends the episode. `ended_clear`, a success, precedes `ended`.
 """
 
 import warp as wp
@@ -17,5 +17,5 @@ def ended_clear(robot: RobotView, state: AttitudeState) -> bool:
 
 @wp.func
 def ended(robot: RobotView, state: AttitudeState) -> bool:
-    """Terminate an episode after `state.episode_steps` policy steps; never if that is 0."""
+    """Terminate an episode after `state.episode_steps` policy steps; never if this number is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps

@@ -65,7 +65,8 @@ def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
 def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
     """Return a cheap lower bound [m^2] on the squared distance of a segment from a box (`segment_box_sq`).
 
-    It is the distance of the segment's own axis-aligned bounding box; most pairs are far apart and need no more.
+    The bound is the distance of the segment's axis-aligned bounding box. For most pairs, which are far apart, the bound
+    suffices.
     """
     gap = wp.max(wp.min(start, end) - half, -half - wp.max(start, end))
     gap_outside = wp.max(gap, vec3(real(0.0)))
@@ -76,8 +77,8 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
     """Return the distance [m] of two rounded shapes, at most `bound` [m], from the squared one of their axes or boxes.
 
-    It is min(sqrt(distance_sq [m^2]) - radius, bound); radius: of both shapes together, bound >= 0. A pair beyond the
-    bound, such as the smallest distance so far, costs no root.
+    The result is min(sqrt(distance_sq [m^2]) - radius, bound). radius: sum of both radii; bound >= 0, such as the
+    smallest distance so far. A pair beyond the bound needs no square root.
     """
     reach = bound + radius
     if distance_sq >= reach * reach:

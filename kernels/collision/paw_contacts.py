@@ -49,8 +49,8 @@ def paw_contacts_kernel(
     """Write every paw's contact with the ground, touching or not, to a row of a `newton.Contacts`.
 
     Row 4 world + leg always belongs to the same paw, so that threads need no shared counter. Shape 0 is the paw, shape
-    1 the ground; launch over (4, num_worlds). force: of the ground on each paw [N], world, (4, num_worlds). contact_f:
-    force [N] and torque [N m] on the paw, world. A block counts as ground.
+    1 the ground; launch over (4, num_worlds). force [N], (4, num_worlds): contact force of the ground on each paw,
+    world axes. contact_f: force [N] and torque [N m] on the paw, world. A block counts as ground.
     """
     leg, world = wp.tid()
     row = 4 * world + leg

@@ -1,4 +1,4 @@
-"""Detection of a robot's forbidden contacts: of links or body shell with the ground, and of links with links or shell.
+"""Detection of a robot's forbidden contacts: links or body shell with the ground, and links with links or shell.
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
@@ -113,7 +113,7 @@ def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
     """Return the smallest distance [m] between links of one leg, at most `bound` (>= 0) [m].
 
     Pairs: thigh to thigh, each thigh to the shank of the other, and shank to shank. The shanks join in the ankle, so
-    only their upper parts (`SHANK_APART`) count; those are nearest at their lower ends.
+    only their upper parts (`SHANK_APART`) count.
     """
     outer_axis, inner_axis = capsules.ends[0], capsules.ends[1]
     outer_knee, inner_knee, paw = capsules.ends[2], capsules.ends[3], capsules.ends[4]
@@ -241,7 +241,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 @wp.func
 def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
-    """Return `collisions` with clearance reduced to `distance` [m] if that is less, and `flag` set if it is < least."""
+    """Return `collisions` with a clearance of at most `distance` [m], and with `flag` set if distance < least."""
     result = Collisions()
     result.flags = collisions.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(collisions.clearance, distance)
@@ -254,7 +254,8 @@ def load_leg(
 ) -> LegCapsules:
     """Return the capsules that model leg 0 to 3 of a world, whose coordinates begin at index `start` of joint_q.
 
-    They are 7 of the base, then of each leg the angles [rad] lateral, outer, outer knee, inner, inner knee.
+    joint_q has 7 coordinates of the base, then the angles [rad] of each leg: lateral, outer, outer knee, inner, inner
+    knee.
     """
     motor = start + 7 + 5 * leg
     return leg_capsules(
@@ -300,9 +301,8 @@ def leg_collisions(
 ) -> int:  # fmt: skip
     """Return the flags of the forbidden contacts of one leg, at position `order` (0 to 3) around the body.
 
-    For kernels with a thread per leg. Order 0 also checks the shell against the ground. The union over all four orders
-    has the flags of the robot. min_distance [m]: links closer than this to another
-    link raise flags.
+    Kernels with a thread per leg call this function. Order 0 also checks the shell against the ground. The union over
+    all four orders has the flags of the robot. min_distance [m]: links closer than this to another link raise flags.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(

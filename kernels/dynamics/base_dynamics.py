@@ -118,7 +118,7 @@ def invert(system: BaseSystem) -> BaseInverse:
 def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
     """Return the base's linear acceleration [m/s^2] under a force [N] and moment [N m].
 
-    For a linear and an angular impulse it is a velocity [m/s].
+    With impulses in place of force and moment, the result is a velocity [m/s].
     """
     return inverse.lin * force + inverse.cross * moment
 
@@ -127,7 +127,7 @@ def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
 def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
     """Return the base's angular acceleration [rad/s^2] under a force [N] and moment [N m].
 
-    For a linear and an angular impulse it is a velocity [rad/s].
+    With impulses in place of force and moment, the result is a velocity [rad/s].
     """
     return wp.transpose(inverse.cross) * force + inverse.ang * moment
 
@@ -136,7 +136,7 @@ def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
 def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
     """Return the motor accelerations [rad/s^2] of a leg for base accelerations [m/s^2], [rad/s^2] in body axes.
 
-    It substitutes the base's solution back into the leg's eliminated equations.
+    The function substitutes the solution for the base into the eliminated equations of the leg.
     """
     return solve.free - solve.to_lin * lin - solve.to_ang * ang
 
@@ -145,7 +145,7 @@ def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
 def sum_systems(base: BaseSystem, leg: BaseSystem) -> BaseSystem:
     """Sum the base's equations of motion and the legs' terms, each from its own thread, over a world's four threads.
 
-    Returns `base` plus the sum of `leg`.
+    The result is `base` plus the sum of `leg`.
     """
     s = BaseSystem()
     s.lin = base.lin + sum_symmetric(leg.lin)

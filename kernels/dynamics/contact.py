@@ -102,7 +102,7 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
     """Return `contact` with its velocity's responses to impulses on the paw, through the leg and the base, filled in.
 
-    These are the fields `from_lin` to `total`; point [m]: point of contact from the base origin, body axes.
+    The function fills the fields `from_lin` to `total`. point [m]: point of contact from the base origin, body axes.
     """
     c = contact
     eye = wp.identity(n=3, dtype=real)
@@ -173,8 +173,8 @@ def sliding_impulse(c: PawContact, free: vec3) -> vec3:
 
     free [m/s]: velocity of the contact point without an impulse on this paw, body axes; the paw neither separates nor
     sticks. The ratio mu p_n / |t| is below 1 at s = 0 and grows without bound, so that some s is on the cone
-    (`SlidingPaw`). The ratio is linear in s if M is isotropic: Newton's method needs few steps; it is replaced by
-    bisection where it leaves the interval known to hold a solution.
+    (`SlidingPaw`). If M is isotropic, the ratio is linear in s, and Newton's method needs few steps. A bisection
+    replaces a Newton step that leaves the interval with the solution.
     """
     paw = sliding_paw(c, free)
     s = real(0.0)
@@ -251,7 +251,7 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Return `contact` as one with the sliding block, which also moves under the paw's impulse.
+    """Return `contact` as a contact with the sliding block, which moves under the impulse of the paw.
 
     `on_block` is set to 1, and the block's response is added to `total`: it slides along the floor only, so that the
     vertical direction is taken out.
@@ -325,8 +325,8 @@ def solve_contacts(
 def contact_mode(impulse: vec3, normal: vec3, mu: real) -> int:
     """Classify a paw's solved contact as SEPARATE, STICK or SLIDE from its impulse [N s].
 
-    normal: unit, out of the ground; mu: friction coefficient. Impulses within 1e-4 of the cone count as sliding, as
-    rounding leaves solved ones on either side of it.
+    normal: unit, out of the ground; mu: friction coefficient. Impulses within 1e-4 of the cone count as sliding, since
+    the rounding errors of the solution are of this size.
     """
     size = wp.dot(impulse, normal)
     if size <= real(0.0):

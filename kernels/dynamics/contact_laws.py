@@ -40,7 +40,7 @@ def contact_at(
 ) -> PawContact:  # fmt: skip
     """Return the contact of paw k with the floor at the solution of a step, with velocity responses to impulses.
 
-    k: 0 to 3. impulse [N s]: body axes. Recomputed from the state at the start of the step, instead of stored.
+    k: 0 to 3. impulse [N s]: body axes. The function recomputes the contact from the state at the start of the step.
     """
     contact = PawContact()
     contact.active = 1
@@ -64,9 +64,9 @@ def paw_law(
 ) -> PawLaw:
     """Return the contact law of paw k (0 to 3), linearised at the solution of a step.
 
-    The matrices are the derivatives of `contact_residual` in its mode; SEPARATE needs none, since p = 0.
-    old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
-    preceding step; all in body axes.
+    The matrices are the derivatives of `contact_residual` in its mode; SEPARATE needs none, since p = 0. old_velocity,
+    velocity [m/s] of the contact point at the start and the end of the step; old_impulse [N s]: in the preceding step;
+    all in body axes.
     """
     law = PawLaw()
     p, n = contact.impulse, contact.normal

@@ -65,7 +65,7 @@ def freeze_diverged_world(
 ):
     """Put a diverged world at rest in its reference pose, without contact forces, and reset its block.
 
-    So Newton's arrays contain no NaN. The world stays in that pose until it is reset (`Workspace.diverged`).
+    Newton's arrays thus contain no NaN. The world stays in that pose until it is reset (`Workspace.diverged`).
     """
     rest_block(model.ground, world)
     for i in range(int(COORDS)):

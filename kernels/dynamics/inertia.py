@@ -141,7 +141,7 @@ def symmetric(xx: real, xy: real, xz: real, yy: real, yz: real, zz: real) -> mat
 def inverse_symmetric(m: mat33) -> mat33:
     """Return the inverse of a symmetric matrix, by cofactors; only the upper triangle is read.
 
-    It is zero for a singular one, so that a body without inertia causes no division by 0.
+    The inverse of a singular matrix is zero here, so that a body without inertia causes no division by 0.
     """
     xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
     xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]

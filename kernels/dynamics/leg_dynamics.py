@@ -1,6 +1,7 @@
 """Terms of one leg in the equations of motion: inertia, couplings to the base, and bias (velocity, gravity) forces.
 
-With the base's linear acceleration a (of its origin), angular one alpha, and motor accelerations q'' and torques tau:
+With the linear acceleration a of the base's origin, its angular acceleration alpha, motor accelerations q'' and torques
+tau:
 
     D q'' + Bv^T a + Bw^T alpha + h = tau
     force on the base origin  = m a - first x alpha + Bv q'' + F
@@ -110,8 +111,8 @@ def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
 def centrifugal(second_j: vec5, w: vec3) -> real:
     """Return the centrifugal torque [N m] on an outer or inner motor due to the angular velocity of its leg's housing.
 
-    It is 1/2 w^T (dI/dq_j) w. second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the housing,
-    housing axes.
+    The torque is 1/2 w^T (dI/dq_j) w. second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the
+    housing, housing axes.
     """
     return real(0.5) * ((second_j[0] + second_j[1]) * wp.dot(w, w) - wp.dot(w, mul_plane(second_j, w)))
 
@@ -120,7 +121,8 @@ def centrifugal(second_j: vec5, w: vec3) -> real:
 def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> MassMoments:
     """Return a leg's mass and its moments of mass about the base origin, body axes; cosine, sine: see `LegPose`.
 
-    The sums are about the hip in housing axes: they are turned to body axes, then shifted by the hip's position.
+    The function turns the sums, which are about the hip in housing axes, to body axes, and shifts them by the position
+    of the hip.
     """
     first = rotate_x(sums.first, cosine, sine)
     body = MassMoments()
@@ -169,8 +171,8 @@ def assemble_leg(
     """Return a leg's inertia, couplings to the base and bias forces from the mass integrals of its links.
 
     rates: motor rates [rad/s]; omega: base angular velocity [rad/s], g: gravity [m/s^2], both in body axes; cosine,
-    sine: see `LegPose`. Bias forces are those of the leg's motion while all accelerations (a, alpha, q'') are zero:
-    computed in the housing frame, which turns with w and still has an acceleration of rotation w_acc, then turned to
+    sine: see `LegPose`. Bias forces result from the motion of the leg while all accelerations (a, alpha, q'') are zero.
+    They are computed in the housing frame, which turns with w and has an angular acceleration w_acc, and then turned to
     body axes.
     """
     zero = real(0.0)
@@ -225,7 +227,7 @@ def assemble_leg(
 def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
     """Return a leg's inertia, couplings to the base and bias forces for its pose, its motor rates and the base's rate.
 
-    rates [rad/s]: of the motors; omega [rad/s], g [m/s^2]: base rate and gravity, body axes.
+    rates [rad/s] of the motors; omega [rad/s], g [m/s^2]: rotation of the base and gravity, body axes.
     """
     bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
     outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)

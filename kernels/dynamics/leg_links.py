@@ -66,7 +66,7 @@ def cross_y_second(s: vec6) -> vec5:
 def spin_y(s: vec6) -> vec3:
     """Return the angular momentum per unit rate [kg m^2] of masses that rotate about +y, from second moments s.
 
-    It is the integral of r x (e_y x r).
+    The result is the integral of r x (e_y x r).
     """
     return vec3(-s[3], s[0] + s[2], -s[5])
 
@@ -144,10 +144,10 @@ def shank_sums(
 def add_thigh(
     shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, sign: real
 ) -> LinkSums:
-    """Add the mass integrals of a thigh to those of the shank below it; link: the thigh's moments in its frame.
+    """Add the mass integrals of a thigh to the integrals of its shank; link: moments of the thigh in its frame.
 
     The thigh rotates about its transversal axis, at x and y `axis` [m], z = 0 in the housing frame, by `sign` (-1 or
-    +1) times its motor's angle; cosine, sine: of that rotation about +y; rate [rad/s]: of the rotation.
+    +1) times its motor's angle; cosine, sine and rate [rad/s] of this rotation about +y.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)
@@ -212,8 +212,8 @@ def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
     """Return the mass integrals of a whole leg; subscripts: o is the outer motor, i the inner.
 
-    The housing, at rest in its own frame, has only mass and moments. In `inner` o and i are swapped (`LinkSums`), and
-    the sign of its Coriolis term with them.
+    The housing, at rest in its own frame, has only mass and moments. In `inner`, o and i are swapped (`LinkSums`), so
+    its Coriolis term has the opposite sign.
     """
     c = LinkSums()
     c.mass = housing.mass + outer.mass + inner.mass

@@ -65,9 +65,10 @@ def robot_momentum(
 def base_with_momentum(base: BaseState, momentum: RobotMomentum, lin: vec3, ang: vec3) -> BaseState:
     """Return the base state with its twist corrected so that the robot's momentum becomes lin, ang (world axes).
 
-    momentum: that of the robot before the correction. lin [kg m/s], ang [kg m^2/s] about the robot's centre of mass;
-    the rates of the motors stay unchanged. With locked joints the robot is one rigid body: the angular velocity changes
-    by the missing angular momentum over its inertia, then the linear velocity by what the centre of mass lacks.
+    momentum: momentum of the robot before the correction. lin [kg m/s], ang [kg m^2/s] about the robot's centre of
+    mass; the rates of the motors stay unchanged. With locked joints, the robot is one rigid body: its angular velocity
+    changes by the missing angular momentum over its inertia. Then the linear velocity changes by the missing velocity
+    of the centre of mass.
     """
     mass = momentum.body.mass
     com = momentum.body.first / mass
@@ -118,7 +119,7 @@ def project_momentum_kernel(
     """Correct the base twist of robots in free flight to the conserved momentum; one thread per world from `first`.
 
     momenta: at the start of an interval of `time` [s]. For that interval, body_f: external wrenches; peak_force [N]:
-    largest total paw force, 0 in flight. Skips held worlds and those with diverged != 0.
+    largest total paw force, 0 in flight. The kernel skips held worlds and worlds with diverged != 0.
     """
     world = first + wp.tid()
     if diverged[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:

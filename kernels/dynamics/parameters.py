@@ -3,7 +3,7 @@
 The physics kernels read the table instead of Newton's arrays: it holds the form that the equations use (moments about a
 link's frame instead of mass, com and inertia), in an order in which neighbouring GPU threads read neighbouring numbers.
 The table is (PARAMETER_ROWS, num_worlds), see `layout`. `load_*` return structs for leg 0 to 3 (FL, FR, BL, BR) of a
-world; units are those of the structs.
+world, in the units of the structs.
 """
 
 import warp as wp

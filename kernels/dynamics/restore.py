@@ -1,6 +1,6 @@
 """Reset of masked worlds to their initial state; masks have shape (num_worlds,).
 
-A launch covers all worlds, of which those with a false mask stay unchanged: the host need not know which are reset.
+A launch covers all worlds, and worlds with a false mask stay unchanged. The host need not know which worlds are reset.
 """
 
 import warp as wp

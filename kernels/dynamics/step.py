@@ -1,9 +1,9 @@
 """Parts of a physics step that CPU (`advance`) and GPU (`advance_legs`) share: equations of leg and base, contact.
 
-Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
-its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR); vectors of motors are lateral, outer, inner. Body axes are x
-ahead, y left, z up, those at the start of the step; quaternions are xyzw, body to world. Normals point out of the
-ground, impulses act on the paw.
+The step is semi-implicit Euler: forces and Jacobians are taken at its start, and positions move with the velocities at
+its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR); vectors of motors are lateral, outer, inner. Body axes (x ahead, y
+left, z up) are taken at the start of the step. Quaternions are xyzw, body to world. Normals point out of the ground,
+impulses act on the paw.
 """
 
 import warp as wp
@@ -36,7 +36,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class RobotModel:
-    """Parameters of the robots and their ground in every world; constant during a launch but for sliding blocks."""
+    """Parameters of the robots and their ground in every world; constant during a launch, except sliding blocks."""
 
     geometry: wp.array(dtype=LegGeometry)  # (4 robots,), see `leg_of`
     table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
@@ -91,8 +91,8 @@ def leg_terms(
     """Return a leg's contribution to a step's equations of motion: dynamics, solution for its motors, paw kinematics.
 
     In body axes; passive forces and pressed stops are included. angles [rad], rates [rad/s], torque [N m] of the
-    motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: of the base, body axes.
-    stop_rates, pressed: see `stops`.
+    motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: rotation of the base and
+    gravity, body axes. stop_rates, pressed: see `stops`.
     """
     geo = params.geometry
     joints = params.joints
@@ -161,8 +161,8 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
 def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
     """Return the parameter-table row of paw k's friction coefficient: static if it stuck before the step, else dynamic.
 
-    velocity [m/s]: of the contact point relative to the ground at the start of the step; impulse [N s]: in the
-    preceding step; normal: unit; all in the same axes.
+    velocity [m/s] of the contact point relative to the ground at the start of the step; impulse [N s]: in the preceding
+    step; normal: unit; all in the same axes.
     """
     slip = velocity - wp.dot(velocity, normal) * normal
     if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(impulse, normal) > real(0.0):
@@ -178,8 +178,8 @@ def paw_contact(
     """Return the contact problem of paw k in a step, with floor or block, whichever is nearer.
 
     lin [m/s], ang [rad/s], rates [rad/s]: base twist (body axes) and motor rates at the end of the step dt [s] without
-    contact; old_rates, base: at its start; impulse [N s]: of the preceding step, world axes, the first guess; pressed:
-    the leg's pressed stops.
+    contact; old_rates, base: values at its start; impulse [N s] of the preceding step, world axes, is the first guess;
+    pressed: the leg's pressed stops.
     """
     contact = PawContact()
     touch = touch_floor(model, world, k, base, paw)

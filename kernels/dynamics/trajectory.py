@@ -2,8 +2,8 @@
 
 A rollout has T policy steps of S physics steps. Motors are 3 * leg + j: legs FL, FR, BL, BR; j lateral, outer, inner.
 Unlike in environments, the latency is a real number, so that the motion has a derivative with respect to it. Rows hold
-Newton's velocities of the base (centre of mass, world axes); `BaseState` has those of the origin and, for the angular
-velocity, body axes. Quaternions are xyzw, body to world.
+Newton's velocities of the base (centre of mass, world axes). `BaseState` has the velocity of the origin, and the
+angular velocity in body axes. Quaternions are xyzw, body to world.
 """
 
 import warp as wp

@@ -1,6 +1,6 @@
 """Errors of a finished jump: apex height and landing position.
 
-The curriculum raises a world's level after jumps whose error is small. Positions are those of the base origin, world
+The curriculum raises a world's level after jumps whose error is small. Positions belong to the base origin, world
 frame, z up. `state.goal` is (x, y of the landing, base height at the apex).
 """
 

@@ -1,7 +1,7 @@
 """Sampling of the ground of an episode: level, with a platform to jump off, or with a block to jump onto.
 
-Policies thus learn landings below and above their start. Lengths are in world axes, z up; the start is above the
-origin. The paws of start and goal must not stand on an edge.
+With such grounds, policies learn to land below and above their start. Lengths are in world axes, z up; the start is
+above the origin. The paws of start and goal must not stand on an edge.
 """
 
 import warp as wp
@@ -80,9 +80,9 @@ def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: w
 def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a sampled block under the goal, or no block if goal and start are too close for its near side.
 
-    The near side lies between the paws at the start and those at the goal. It crosses the axis (x or y) along which the
-    goal is farther. Beyond the nearest place its distance is u^2 times the free length, u uniform in [0, 1): near
-    blocks are frequent. foot, goal: as in `sample_platform`.
+    The near side lies between the paws at the start and the paws at the goal, across the axis (x or y) along which the
+    goal is farther. Its distance from the nearest possible place is u^2 times the free length, with u uniform in [0,
+    1), so near blocks are frequent. foot, goal: as in `sample_platform`.
     """
     along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)  # axis: 0 x, 1 y
     distance = wp.abs(goal[along])

@@ -36,7 +36,7 @@ def jump_command(robot: RobotView, state: JumpState) -> float:
 def goal(robot: RobotView, state: JumpState) -> wp.vec2:
     """Horizontal vector from base to goal [m], ahead and to the left in the base's heading; 0 before the command.
 
-    A hidden goal makes robots wait for the command.
+    Since the goal is hidden before the command, robots wait for it.
     """
     offset = wp.vec3(0.0)
     if state.steps >= state.command_step:

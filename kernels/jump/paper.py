@@ -26,7 +26,7 @@ def height_reward(error: float, std: float, scale: float) -> float:
 def jump_height(robot: RobotView, state: JumpState, std: float, scale: float) -> float:
     """Reward for a jump whose highest base height is close to the commanded one, given once, at the apex.
 
-    It is phi_std + 3 psi_scale of their difference [m].
+    The reward is phi_std + 3 psi_scale of their difference [m].
     """
     if state.at_apex == 0:
         return 0.0
@@ -37,7 +37,8 @@ def jump_height(robot: RobotView, state: JumpState, std: float, scale: float) ->
 def estimated_jump_height(robot: RobotView, state: JumpState, std: float, scale: float) -> float:
     """Reward for a ballistic apex of the base close to the commanded height, in flight before the apex.
 
-    It is phi_std + 3 psi_scale of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z if the base falls.
+    The reward is phi_std + 3 psi_scale of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z if the base
+    falls.
     """
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
@@ -55,8 +56,8 @@ def tracking(robot: RobotView, state: JumpState, std: float) -> float:
 def estimated_tracking(robot: RobotView, state: JumpState, std: float, std_wide: float, height: float) -> float:
     """Reward in flight for a predicted landing of the base close to the goal.
 
-    It is phi_std + 0.1 phi_wide of the distance [m]. The predicted landing is p_xy + t v_xy with
-    t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
+    The reward is phi_std + 0.1 phi_wide of the distance [m]. The predicted landing is p_xy + t v_xy with t = (v_z +
+    sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -75,7 +76,7 @@ def orientation_error(robot: RobotView, state: JumpState, std: float) -> float:
 def flight_orientation_error(robot: RobotView, state: JumpState, std: float) -> float:
     """Reward for a level base with the jump's heading, in flight while the base moves toward the goal.
 
-    It is phi_std of the squared rotation error [rad^2].
+    The reward is phi_std of the squared rotation error [rad^2].
     """
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
@@ -86,7 +87,7 @@ def flight_orientation_error(robot: RobotView, state: JumpState, std: float) -> 
 def landed_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
     """Reward after touchdown for motor angles near the default pose plus `shift` [rad] on transversal angles.
 
-    It is phi_std of the rms motor offset [rad] from that pose.
+    The reward is phi_std of the rms motor offset [rad] from that pose.
     """
     if state.phase != LANDED:
         return 0.0

@@ -46,7 +46,7 @@ def landing_error_estimate(robot: RobotView, state: JumpState, height: float) ->
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step; takeoff_speed: of `in_flight`."""
+    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step; takeoff_speed: see `in_flight`."""
     flies = in_flight(robot, state.phase == FLIGHT, takeoff_speed)
     if state.phase == STANCE and flies:
         return FLIGHT
@@ -59,8 +59,8 @@ def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
 def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
     """Return the state of a jump (phase, apex, landing) updated by one policy step.
 
-    takeoff_speed [m/s]: least upward speed of a takeoff. Contact in flight that is no touchdown moves the takeoff to
-    its step: flight and apex are counted from there.
+    takeoff_speed [m/s]: least upward speed of a takeoff. A contact in flight that is no touchdown restarts the flight:
+    takeoff and apex then count from this step.
     """
     t = state
     t.steps = state.steps + 1

@@ -1,6 +1,6 @@
 """Cost of the planned motion of a jump, with a reverse pass: a weighted sum of terms over the rows of a trajectory.
 
-The ground is level, at height 0. Weights depend on the row, as of a term that counts after the landing only.
+The ground is level, at height 0. The weights depend on the row, so that a term can count after the landing only.
 """
 
 import warp as wp
@@ -22,14 +22,14 @@ SHELL = wp.constant(vec3(real(0.343), real(0.112), real(-0.049)))  # [m] lower c
 
 @wp.func
 def lacking_sq(height: real, radius: real) -> real:
-    """Return the square of the height [m] that a sphere of a radius [m] lacks to the margin above the ground."""
+    """Return the squared height [m^2] by which a sphere of a radius [m] is too low for its margin above the ground."""
     lacking = wp.max(MARGIN + radius - height, real(0.0))
     return lacking * lacking
 
 
 @wp.func
 def leg_lacking_sq(geo: LegGeometry, leg: LegCapsules, z: real, up: vec3) -> real:
-    """Return the sum of squared lacking heights [m^2] of a leg's housing, knees and shanks.
+    """Return the sum of `lacking_sq` [m^2] over a leg's housing, knees and shanks.
 
     z: height of the base [m]; up: world z in body axes.
     """

@@ -1,9 +1,9 @@
-"""Start of jumps: of the first one at a reset (`reset_jump`), and of further ones within an episode.
+"""Start of the first jump at a reset (`reset_jump`), and of further jumps within an episode.
 
-They are functions of all jump tasks. They sample start mode, goal, ground and time of the command; `start_states`
-samples the state of the robot. An episode begins above the origin, in any part of a jump (the start mode), so that
-late parts are learnt before early ones succeed. World z is up; a heading is a yaw [rad]. Random numbers are identified
-by their index in a stream (`streams`); policy steps last 1/60 s.
+All jump tasks use these functions. They sample start mode, goal, ground and time of the command; `start_states` samples
+the state of the robot. An episode begins above the origin, in any part of a jump (the start mode), so that late parts
+are learnt before early ones succeed. World z is up; a heading is a yaw [rad]. Random numbers are identified by their
+index in a stream (`streams`); policy steps last 1/60 s.
 """
 
 import warp as wp
@@ -73,7 +73,7 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) -> int:
     """Return the sampled number of policy steps from touchdown to the next goal; 0: there is no further jump.
 
-    delay: range of the number; probability: of a further jump.
+    delay: range of the number; probability of a further jump.
     """
     steps = whole_steps(uniform_range(rng, streams.AGAIN_STEP, delay))
     return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)
@@ -83,8 +83,9 @@ def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) ->
 def sample_command_step(rng: RngStream, ranges: start_states.ResetRanges) -> int:
     """Return the sampled policy step at which the jump is commanded.
 
-    It is up to `long_wait` with `long_wait_probability`, else up to `command_delay`. A varying delay makes the robot
-    wait for the command. One random number u selects the case and, rescaled to [0, 1), the step within it.
+    The step is at most `long_wait` with `long_wait_probability`, else at most `command_delay`. With a random delay, the
+    robot learns to wait for the command. One random number u selects the case and, rescaled to [0, 1), the step within
+    it.
     """
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     probability = ranges.long_wait_probability
@@ -100,8 +101,8 @@ def begin_jump(
 ) -> JumpState:  # fmt: skip
     """Return the task state of a new episode: phase of the jump and time of its command, according to the start mode.
 
-    goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base. An episode that begins after
-    the apex is given the commanded height as its apex, since its own cannot be known.
+    goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base. If an episode begins after the
+    apex, its apex is not known: the commanded height replaces it.
     """
     state = JumpState()
     state.start_mode = start_mode
@@ -161,7 +162,8 @@ def begin_next_jump(robot: RobotView, old: JumpState, ground: Ground, goal: wp.v
 def place_ground(ground: Ground, start: start_states.JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
     """Sample a new block for a world, or put the present one back to its start position; return the world's ground.
 
-    It is sampled if a probability of `grounds` is positive; only standing starts (STANDING, DEFAULT) get a block.
+    The block is sampled if a probability of `grounds` is positive. Only standing starts (STANDING, DEFAULT) get a
+    block.
     """
     if grounds.platform + grounds.block > 0.0:
         block = Block()
@@ -180,8 +182,8 @@ def reset_jump(
 ) -> JumpState:  # fmt: skip
     """Write a start state of a jump to world `rng.world` (`write_start`), and return the state of its new episode.
 
-    old: state of the previous episode, whose policy steps count toward its start mode: modes can be balanced by
-    steps (`ResetRanges.by_steps`), as episodes that begin late are short. skill: has the motors' limits.
+    old: state of the previous episode. Its policy steps count toward its start mode: modes can be balanced by steps
+    (`ResetRanges.by_steps`), since episodes that begin late are short. skill: has the motors' limits.
     """
     world = rng.world
     ranges = settings.states
@@ -247,6 +249,6 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
 def from_standing(state: JumpState) -> bool:
     """Return whether the episode began standing or in the default pose, and so counts for the curriculum.
 
-    Other episodes begin in the middle of a jump, whose success is partly given.
+    Other episodes begin in the middle of a jump, so their success proves less.
     """
     return state.start_mode <= start_states.DEFAULT

@@ -25,7 +25,7 @@ REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which 
 
 @wp.func
 def waiting_weight(state: JumpState, waiting_scale: float) -> float:
-    """Return `waiting_scale` between command and takeoff, else 1: the factor on rewards for which no jump is needed."""
+    """Return the factor on rewards that need no jump: `waiting_scale` between command and takeoff, else 1."""
     return wp.where(waiting(state), waiting_scale, 1.0)
 
 
@@ -39,7 +39,7 @@ def just_landed(state: JumpState) -> bool:
 def should_rest(state: JumpState) -> bool:
     """Return whether the robot should stand still: before the jump's command, and from 0.5 s after touchdown.
 
-    In between it must move, to jump or to absorb the landing.
+    Between these times it must move, to jump or to absorb the landing.
     """
     if state.phase == LANDED:
         return state.phase_steps >= REST_STEPS
@@ -50,7 +50,7 @@ def should_rest(state: JumpState) -> bool:
 def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
     """Return the reward for a height error [m]: sum of a fine Gaussian, 3 times a Laplacian, and a wide Gaussian.
 
-    It is phi_fine + 3 psi_sharp + phi_wide of the error; phi_wide gives low jumps a gradient.
+    The reward is phi_fine + 3 psi_sharp + phi_wide of the error; phi_wide gives low jumps a gradient.
     """
     return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
@@ -59,7 +59,7 @@ def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
     """Reward for a jump whose highest base height is close to the commanded one, given once, at the apex.
 
-    It is phi_fine + 3 psi_sharp + phi_wide of their difference [m].
+    The reward is phi_fine + 3 psi_sharp + phi_wide of their difference [m].
     """
     if state.at_apex == 0:
         return 0.0
@@ -72,7 +72,7 @@ def squat(
 ) -> float:
     """Reward for a squat as deep as the commanded height needs, given once, at the apex.
 
-    It is phi_std of the difference [m] between the lowest base height before takeoff and `wanted_squat`.
+    The reward is phi_std of the difference [m] between the lowest base height before takeoff and `wanted_squat`.
     """
     if state.at_apex == 0:
         return 0.0
@@ -85,8 +85,8 @@ def estimated_jump_height(
 ) -> float:
     """Reward for a ballistic apex of the base close to the commanded height, in flight before the apex.
 
-    It is phi_fine + 3 psi_sharp + phi_wide of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z if the
-    base falls.
+    The reward is phi_fine + 3 psi_sharp + phi_wide of their difference [m]. The ballistic apex is z + v_z^2 / 2g, or z
+    if the base falls.
     """
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
@@ -136,8 +136,8 @@ def joint_symmetry(
 ) -> float:
     """Reward for equal transversal motor angles in all legs, and lateral angles close to 0.
 
-    It is phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad]). From the command to the
-    takeoff it is multiplied by `waiting_scale` [1].
+    The reward is phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad]). From the command
+    to the takeoff it is multiplied by `waiting_scale` [1].
     """
     total = float(0.0)
     total_sq = float(0.0)
@@ -157,8 +157,8 @@ def joint_symmetry(
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
     """Reward in stance and after touchdown for motor angles near the default pose plus `shift` on transversal angles.
 
-    It is phi_std of the rms motor offset [rad] from that pose, multiplied by `waiting_scale` [1] from the command to
-    the takeoff.
+    The reward is phi_std of the rms motor offset [rad] from that pose, multiplied by `waiting_scale` [1] from the
+    command to the takeoff.
     """
     if state.phase == FLIGHT:
         return 0.0
@@ -205,7 +205,7 @@ def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: 
 def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
     """Reward for a base close to the goal after takeoff, horizontally.
 
-    It is phi_wide + fine_weight phi_fine of the distance [m].
+    The reward is phi_wide + fine_weight phi_fine of the distance [m].
     """
     if state.phase == STANCE:
         return 0.0
@@ -227,8 +227,8 @@ def estimated_tracking(
 ) -> float:
     """Reward for a ballistic landing of the base close to the goal, in flight.
 
-    It is phi_middle + 0.1 phi_wide + 0.3 phi_fine of their distance [m]. The ballistic landing is p_xy + t v_xy with
-    t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
+    The reward is phi_middle + 0.1 phi_wide + 0.3 phi_fine of their distance [m]. The ballistic landing is p_xy + t v_xy
+    with t = (v_z + sqrt(v_z^2 + 2g (z - h))) / g, where the base falls through h, `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -240,7 +240,7 @@ def estimated_tracking(
 def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
     """Reward for a level base with the jump's heading, in flight while the base moves toward the goal.
 
-    It is phi_std of the rotation angle [rad] from that orientation.
+    The reward is phi_std of the rotation angle [rad] from that orientation.
     """
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
@@ -296,8 +296,8 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
     """Penalty of decelerating the base in stance: minus deceleration / limit [m/s^2], clamped to -1..0.
 
-    The value is negative, so its weight is positive. `base_deceleration` is minus the deceleration, <= 0. It keeps a
-    squat from ending abruptly.
+    The value is negative, so its weight is positive. `base_deceleration` is minus the deceleration, <= 0. The term
+    keeps a squat from ending abruptly.
     """
     if state.phase != STANCE:
         return 0.0
@@ -334,7 +334,7 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
     """Reward for a motionless base while the robot should rest.
 
-    It is phi(speed [m/s]) times phi(angular speed [rad/s]).
+    The reward is phi(speed [m/s]) times phi(angular speed [rad/s]).
     """
     if not should_rest(state):
         return 0.0
@@ -390,8 +390,9 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
     """Reward after touchdown for a capture point (where an inverted pendulum stops) near the middle of the paws.
 
-    It is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), with the base's position p,
-    velocity v and height h. A robot whose capture point is between its paws comes to rest without another step.
+    The reward is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), with the base's
+    position p, velocity v and height h. A robot whose capture point is between its paws comes to rest without another
+    step.
     """
     if state.phase != LANDED:
         return 0.0
@@ -416,8 +417,8 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
     """Penalty of changes of motor torque while the robot should rest: sum of their squares [N^2 m^2].
 
-    The change is that from one policy step to the next, each at its last physics step. The base can rest while
-    motors chatter; this term makes them quiet.
+    The change is from the last physics step of one policy step to the last physics step of the next. The base can rest
+    while motors chatter; this term makes them quiet.
     """
     if not should_rest(state):
         return 0.0
@@ -428,8 +429,8 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
     """Penalty of paw forces that vary within a policy step while the robot should rest.
 
-    It is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2; weight_force is
-    the robot's weight. It penalises contact that chatters between two policy steps.
+    The penalty is the sum over paws of ((largest force - force in the last physics step) / weight_force [N])^2;
+    weight_force is the robot's weight. The term penalises contact that chatters within a policy step.
     """
     if not should_rest(state):
         return 0.0

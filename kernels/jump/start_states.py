@@ -123,8 +123,8 @@ def start_mode_at(probability: vec_start_modes, u: float) -> int:
 def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
     """Return the start mode with the largest deficit of policy steps: its wanted number less its number so far.
 
-    The wanted number is the mode's `probability` times all policy steps; the probabilities add up to 1. Balanced by
-    episodes instead, modes with short episodes would have too few samples.
+    The wanted number is the mode's `probability` times all policy steps; the probabilities add up to 1. With a balance
+    of episodes instead of steps, modes with short episodes would have too few samples.
     """
     total = float(0.0)
     for i in range(NUM_START_MODES):
@@ -143,7 +143,7 @@ def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_m
 def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
     """Return the start mode of a new episode: a random one, or with `ranges.by_steps` the `least_sampled_mode`.
 
-    While no policy steps are counted it is random in both cases.
+    Before any policy step is counted, the mode is random in both cases.
     """
     if ranges.by_steps != 0 and wp.length_sq(steps_per_mode) > 0.0:
         return least_sampled_mode(ranges.start_probability, steps_per_mode)
@@ -182,7 +182,7 @@ def goal_direction(start: JumpStart) -> wp.vec3:
 def standing_base(start: JumpStart, rng: RngStream) -> JumpBase:
     """Return the sampled base state of a standing start: at rest over paws around the origin.
 
-    A deeper squat may lean farther back (`lean`), from which the farthest jumps start.
+    A deeper squat may lean farther back (`lean`): the farthest jumps start from such squats.
     """
     ranges = start.ranges
     lower = start.base_height[0]
@@ -312,9 +312,9 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return sampled motor angles of leg `leg` in flight, with rates 0.
 
-    They are marked as reachable if the paw is at least 0.01 m above the ground. They are within 0.03 rad (lateral) or
-    0.1 rad (outer, inner) of a value sampled once for all legs, as legs in a flight are nearly symmetric. The random
-    indices without `leg` give all legs the same number.
+    The angles are marked as reachable if the paw is at least 0.01 m above the ground. Legs in flight are nearly
+    symmetric: the angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value that is sampled once for
+    all legs. Random indices that do not depend on `leg` give all legs the same number.
     """
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]

@@ -54,7 +54,7 @@ def commanded(state: JumpState) -> bool:
 
 @wp.func
 def waiting(state: JumpState) -> bool:
-    """Return whether the robot is still in stance although a jump is commanded: preparing it, or idle."""
+    """Return whether the robot is still in stance although a jump is commanded: it prepares the jump, or is idle."""
     return state.phase == STANCE and state.steps >= state.command_step
 
 
@@ -62,8 +62,9 @@ def waiting(state: JumpState) -> bool:
 def wanted_squat(robot: RobotView, state: JumpState, takeoff_height: float, acceleration: float, floor: float) -> float:
     """Return the base height [m] from which a constant acceleration gives the speed for the commanded apex.
 
-    With gravity g and the height z above which the base no longer accelerates, `takeoff_height` [m], the speed is
-    v = sqrt(2 g (apex - z)), and the way v^2 / 2a with `acceleration` a [m/s^2]. The result is at least `floor` [m].
+    Above the height z, `takeoff_height` [m], the base no longer accelerates. With gravity g, its speed there is v =
+    sqrt(2 g (apex - z)), and it accelerates over v^2 / 2a with `acceleration` a [m/s^2]. The result is at least `floor`
+    [m].
     """
     rise = wp.max(state.goal[2] - takeoff_height, 0.0)
     return wp.max(takeoff_height - rise * robot.gravity_magnitude / acceleration, floor)

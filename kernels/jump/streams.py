@@ -1,6 +1,7 @@
 """Indices in the random streams of a jump (`mdp.random.uniform`), one name for each sampled quantity.
 
-Alternatives share indices: a start samples only those of its mode, an episode only those of its ground.
+Alternatives share indices: a start samples only the quantities of its mode, an episode only the quantities of its
+ground.
 """
 
 # in the stream `RESET` of an episode; GOAL and AGAIN also in `COMMAND`, for the next jump of an episode

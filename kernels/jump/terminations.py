@@ -1,7 +1,8 @@
 """Termination terms of jumps, as functions of robot, jump and parameters; times in policy steps of 1/60 s.
 
-Apart from `landed_for`, each ends an attempt that has failed or would damage the robot, so that no reward follows and
-training time goes to good jumps. World z is up. `state.goal` is (x, y of the landing, base height at the apex).
+Except `landed_for`, each term ends an attempt that has failed or would damage the robot. The robot then gets no further
+reward, and good jumps get more of the training time. World z is up. `state.goal` is (x, y of the landing, base height
+at the apex).
 """
 
 import warp as wp
@@ -46,7 +47,7 @@ def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: 
 def turned_touchdown(robot: RobotView, state: JumpState, rotation: float, yaw: float) -> bool:
     """Terminate at touchdown if the base's orientation is too far from level with the jump's heading.
 
-    Limits [rad]: `rotation` of the rotation angle between the two orientations, `yaw` of the yaw error.
+    `rotation` [rad] is the largest angle between the two orientations, `yaw` [rad] the largest error of the yaw.
     """
     turn = yaw_of(robot.quat) - state.heading
     yaw_error = wp.abs(wp.atan2(wp.sin(turn), wp.cos(turn)))
@@ -100,7 +101,7 @@ def hard_impact(robot: RobotView, state: JumpState, stance: float, flight: float
 def no_jump(robot: RobotView, state: JumpState, steps: float, idle_steps: float) -> bool:
     """Terminate if no takeoff follows a command within `steps` policy steps, or the robot idles instead of pushing off.
 
-    It idles if the base rests for more than `idle_steps` policy steps.
+    A robot idles if its base rests for more than `idle_steps` policy steps.
     """
     late = state.steps - state.command_step > whole_steps(steps)
     return waiting(state) and (late or state.idle_steps > whole_steps(idle_steps))
@@ -125,7 +126,7 @@ def shallow_squat(
 def crouched(robot: RobotView, state: JumpState, height: float, start_steps: float, landing_steps: float) -> bool:
     """Terminate if the base is lower than `height` [m] although the robot has had time to stand up.
 
-    It has `start_steps` policy steps from the start of an episode, until the command, and `landing_steps` from
+    The time is `start_steps` policy steps from the start of an episode, until the command, and `landing_steps` from
     touchdown.
     """
     if robot.height >= height:

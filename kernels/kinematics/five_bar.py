@@ -60,7 +60,8 @@ class FiveBarBias:
 def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
     """Return a five-bar link's rate about +y [rad/s] from the velocity [m/s] of its far end relative to its near end.
 
-    direction: unit vector (x, z) from the near end to the far end; length [m]. Accelerations give [rad/s^2] likewise.
+    direction: unit vector (x, z) from the near end to the far end; length [m]. With an acceleration in place of the
+    velocity, the result is in [rad/s^2].
     """
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 
@@ -132,8 +133,8 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
 def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> FiveBarBias:
     """Return the five-bar's link rates and velocity-product accelerations for the motor rates [rad/s].
 
-    The equations of motion need them, as constant motor rates do not mean constant link rates. The ankle's acceleration
-    along each shank is that of the knee less the shank's centripetal one.
+    The equations of motion need these values, since constant motor rates do not imply constant link rates. Along each
+    shank, the acceleration of the ankle is the acceleration of the knee less the centripetal acceleration of the shank.
     """
     f = geo.front
     bias = FiveBarBias()

@@ -62,7 +62,7 @@ def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) ->
 def link_frame(housing: Frame, origin: vec3, velocity: vec3, angle: real, rate: real) -> Frame:
     """Return pose and velocity in the world of the frame of a link in the five-bar's plane.
 
-    origin [m], velocity [m/s]: of its origin in the housing frame; angle [rad], rate [rad/s]: about housing y.
+    origin [m], velocity [m/s] of the link's origin in the housing frame; angle [rad], rate [rad/s] about housing y.
     """
     frame = Frame()
     arm = wp.quat_rotate(housing.quat, origin)

@@ -42,9 +42,9 @@ def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: 
 def damped_ratio(speed: real, lever: real) -> real:
     """Return a thigh's rate [rad/s] for an ankle speed along the shank, damped where thigh and shank nearly align.
 
-    It is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s]: of the ankle along the
-    shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is below LEVER_FLOOR where thigh and shank
-    are within 3.3 degrees of one line, and no bounded rate reaches the speed.
+    The rate is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s] of the ankle
+    along the shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is below LEVER_FLOOR where thigh
+    and shank are within 3.3 degrees of one line, and no bounded rate reaches the speed.
     """
     return speed * lever / wp.max(lever * lever, LEVER_FLOOR * LEVER_FLOOR)
 
@@ -73,7 +73,7 @@ def leg_inverse_velocity(geo: LegGeometry, angles: vec3, paw_vel: vec3) -> vec3:
 def knee_angles(geo: LegGeometry, loop: FiveBar, outer: real, inner: real) -> vec2:
     """Return the passive (outer, inner) knee angles [rad] of a loop at motor angles [rad]; positive bends inward.
 
-    A knee angle is the rotation of the shank less that of the thigh; rotations are about housing +y, from -z.
+    A knee angle is the rotation of the shank less the rotation of the thigh; rotations are about housing +y, from -z.
     """
     outer_shank = wp.atan2(-loop.outer_shank[0], -loop.outer_shank[1])
     inner_shank = wp.atan2(-loop.inner_shank[0], -loop.inner_shank[1])

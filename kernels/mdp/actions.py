@@ -37,7 +37,7 @@ def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
     """Write the two targets [rad] that motor m follows in this policy step, and the physics step at which it switches.
 
     step_count: policy steps of the world so far. The latency is `delays.steps` physics steps: `whole` policy steps and
-    a remainder, during which the motor still follows the target before that.
+    a remainder. During the remainder, the motor still follows the older target.
     """
     whole = delays.steps[world] // delays.substeps
     delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
@@ -59,7 +59,7 @@ def action_kernel(
 ):
     """Turn the policy's action into motor targets (clamp, scale, filter, delay); one thread per (leg, world).
 
-    policy_action: (skills, num_worlds, 12), of which each world uses that of its skill. A non-finite action counts as 0
+    policy_action: (skills, num_worlds, 12); each world uses the action for its skill. A non-finite action counts as 0
     and sets `bad_action` of its world. push: see `begin_policy_step`.
     """
     leg, world = wp.tid()

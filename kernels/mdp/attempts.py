@@ -59,8 +59,8 @@ def vec_from_leg(v: vec3, leg: int) -> vec3:
 def sync_attempts(rng: RngStream):
     """Synchronise the threads that sample a world's start state; no effect with one thread per world.
 
-    What one thread has written before is visible to all after it, and no thread overwrites what another has yet to
-    read.
+    Values that a thread has written before the call are visible to all threads after it. No thread overwrites a value
+    before all threads have read it.
     """
     if rng.lanes > 1:
         sync_lanes()
@@ -81,7 +81,8 @@ def pose_is_valid(
     """Return whether a sampled pose is valid: all four legs are reachable and free of collisions.
 
     The threads of an attempt exchange their legs. sample: last leg that this thread sampled; reachable: whether all
-    legs of this thread are. joint_q (COORDS,) and joint_qd (DOFS,): coordinates of the attempt, completed here.
+    legs of this thread are reachable. joint_q (COORDS,) and joint_qd (DOFS,): coordinates of the attempt, completed
+    here.
     """
     legs = wp.int32(4)
     all_reachable = all_legs(rng, reachable)

@@ -1,4 +1,4 @@
-"""Durations in policy steps, of which 2^31 or more mean never."""
+"""Durations in policy steps; 2^31 or more steps mean "never"."""
 
 import warp as wp
 

@@ -22,7 +22,7 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
     """Return a random number of policy steps, at least 1, until an interval event is due again.
 
-    The time until then is uniform from least to most [s]; step_dt [s]: policy step.
+    The interval is uniform from least to most [s]. step_dt: duration of a policy step [s].
     """
     return wp.max(whole_steps(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 

@@ -1,6 +1,6 @@
 """Rewards and observations of a policy step as differentiable functions of the robot's state.
 
-Phase machine, events and contacts are constants of a step: the gradient is that of the branch that the step took.
+Phase machine, events and contacts are constants of a step: the gradient belongs to the branch of this step.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ def make_gradient_kernel(task: Any) -> wp.Kernel:
     ):
         """Evaluate rewards, weights applied, (rewards, num_worlds), and observation terms, (components, num_worlds).
 
-        One thread per world. states: of the task before the step. Robot parameters that a policy observes are
+        One thread per world. states: states of the task before the step. Robot parameters that a policy observes are
         constants: their rows of `raw` stay.
         """
         world = wp.tid()

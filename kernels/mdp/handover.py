@@ -24,8 +24,8 @@ def hand_over(
 ):  # fmt: skip
     """Make skill `target` active in a world: set its motor constants, and clear the observation history.
 
-    The request of a task (`Env.request`) is cleared too. The previous actions, which the policy of `target` observes,
-    become the `target` action that yields the present filtered motor targets: as if it had been active before.
+    The request of a task (`Env.request`) is cleared too. The policy of `target` observes previous actions. They become
+    the action of `target` that yields the present filtered motor targets, as if this skill had been active before.
     """
     episode.skill[world] = target
     episode.requested_task[world] = NONE

@@ -1,9 +1,8 @@
-"""Left-right mirror images of observations: a robot mirrored about its x-z plane observes them.
+"""Left-right mirror images: observations of a robot that is mirrored about its x-z plane.
 
-A mirror image is a signed permutation. Entry i is the column, counted from 1, from which column i of the mirror image
-comes; it is negative if the sign changes. Lateral angles are positive outward, and transversal angles away from the
-leg's other link, so motors swap sides and keep their signs. Training can use mirror images too, since the robot is
-symmetric.
+A mirror image is a signed permutation of columns. Entry i names the column, counted from 1, that becomes column i; it
+is negative if the sign changes. Lateral angles are positive outward, and transversal angles away from the leg's other
+link, so motors swap sides and keep their signs. A training can use mirror images, since the robot is symmetric.
 """
 
 from typing import Any

@@ -19,8 +19,8 @@ NO_WORLD = wp.constant(-1)  # `NonFinite.world` of a term that was always finite
 class NonFinite:
     """First non-finite value of each term of a task in each slice (range) of worlds; arrays of (slices * terms, ...).
 
-    Terms: the rewards, the curriculum, the diverged state, then the observations of all groups. Slices have records of
-    their own, since threads of a CPU, which advance them together, have no atomic operations.
+    Terms: the rewards, the curriculum, the diverged state, then the observations of all groups. Each slice has its own
+    records: on a CPU, threads advance the slices at the same time, without atomic operations.
     """
 
     world: wp.array(dtype=int)  # NO_WORLD: all values were finite

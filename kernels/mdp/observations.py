@@ -42,7 +42,7 @@ def height(robot: RobotView, state: Any) -> float:
 
 @wp.func
 def angle(robot: RobotView, state: Any) -> vec12:
-    """Motor angles as the position sensors read them, less those of the default pose [rad]."""
+    """Motor angles with the errors of the position sensors, less the angles of the default pose [rad]."""
     return robot.sensed_angle - robot.default_angle
 
 

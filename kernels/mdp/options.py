@@ -11,8 +11,8 @@ _definitions: dict[str, list] = {}  # structs by their key, in the order of thei
 def kernel_name(name: str, *structs: Any) -> str | None:
     """Return a kernel name that distinguishes structs of equal names, or None where Warp's default name suffices.
 
-    A struct that is defined again, as by a notebook's cell that runs again, needs kernels of another name: Warp would
-    return the kernels with equal code, whose arguments have the earlier struct.
+    If a struct is defined again, for example in a notebook's cell, its kernels need another name. Otherwise Warp
+    returns the kernels with equal code, whose arguments have the earlier struct.
     """
     numbers = []
     for struct in structs:

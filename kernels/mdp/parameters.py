@@ -127,7 +127,7 @@ def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
 
 @wp.func
 def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
-    """Write no-load and cutoff speed of motor m in a world: the active skill's nominal ones times `ratio`.
+    """Write no-load and cutoff speed of motor m in a world: the nominal speeds of the active skill times `ratio`.
 
     Unless both ratios are 1, the cutoff speed is at most 0.95 of the no-load speed: the torque falls from its peak to 0
     between them.
@@ -190,7 +190,7 @@ def speed_limits(
 
 @wp.func
 def joint_offset(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Set each motor's position sensor error to its nominal value plus a random one from lower to upper [rad]."""
+    """Set each motor's position sensor error to its nominal value plus a random error from lower to upper [rad]."""
     for m in range(rng.lane, 12, rng.lanes):
         robot.motors.offset[m, rng.world] = robot.nominal_offset[m] + uniform(rng, m, lower, upper)
 
@@ -202,7 +202,7 @@ def friction(
 ):  # fmt: skip
     """Sample dynamic and static friction coefficients [1] of a robot's paws from their ranges, each one shifted.
 
-    shift: `friction_move`; limits below 0 become 0. The static one is at least the dynamic one.
+    shift: `friction_move`; limits below 0 become 0. The static coefficient is at least the dynamic coefficient.
     """
     dynamic = moved_uniform(rng, 0, dynamic_lower, dynamic_upper, robot.friction_move[0])
     static = wp.max(moved_uniform(rng, 1, static_lower, static_upper, robot.friction_move[1]), dynamic)
@@ -231,8 +231,8 @@ def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: 
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
     """Sample the latency of actions uniformly from a range (lower, upper) [s], shifted by `latency_move`.
 
-    Limits below 0 become 0. With `zero_probability` it is the nominal one, which is 0 for the described robot, unless
-    lower is upper.
+    Limits below 0 become 0. With `zero_probability`, the latency is nominal (0 for the described robot), unless lower
+    is upper.
     """
     seconds = moved_uniform(rng, 0, lower, upper, robot.latency_move)
     if is_nominal(rng, lower, upper, zero_probability):

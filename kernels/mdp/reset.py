@@ -157,7 +157,7 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 @wp.func
 def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
-    """Write the default pose at rest to a world, at x = y = 0; heading: yaw [rad], ground_height: of the ground [m]."""
+    """Write the default pose at rest to a world, at x = y = 0; heading: yaw [rad]; ground_height [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
         arrays.joint_q[q + j] = scene.reference_q[q + j]

@@ -44,7 +44,7 @@ def posture_offset(robot: RobotView, shift: float) -> float:
 
 @wp.func
 def level(robot: RobotView, state: Any, width: float) -> float:
-    """Reward for a level base: Gaussian kernel phi of the base's tilt [rad]; width [rad]: of the kernel."""
+    """Reward for a level base: Gaussian kernel phi of the base's tilt [rad]; width [rad] of the kernel."""
     return phi(tilt(robot), width)
 
 

@@ -1,8 +1,9 @@
 """End of a policy step: advance the task's state, then terminations, rewards and the curriculum.
 
 A task's terms are compiled into one kernel, which loads the robot once. Their numbers (weights, widths) are read from
-the array `p`, so that they can change without another kernel. An episode ends by failure (`terminated`, its value is 0
-from then on) or without (`truncated`, as at a time limit, where training estimates the value of what would follow).
+the array `p`, so that they can change without another kernel. An episode ends by failure (`terminated`: no reward
+follows) or otherwise (`truncated`, as at a time limit: the training estimates the value of the steps that would
+follow).
 """
 
 from typing import Any
@@ -54,8 +55,8 @@ def write_step_result(
 ):  # fmt: skip
     """Write reward, done flags and termination of a world's policy step, and advance its step count.
 
-    total: sum of rewards. termination: index of the termination term, NOT_TERMINATED if none. timeout: 1 if it is one
-    without failure, else 0. diverged: whether the state is invalid.
+    total: sum of rewards. termination: index of the termination term, NOT_TERMINATED if none. timeout: 1 if this
+    termination is no failure, else 0. diverged: whether the state is invalid.
     """
     episode.reward[world] = total
     episode.termination[world] = termination

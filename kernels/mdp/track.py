@@ -60,8 +60,8 @@ def paw_clearance(geo: LegGeometry, ground: Ground, world: int, pos: wp.vec3) ->
 def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
     """Update contact time, air time [s] and touchdown speed [m/s] of a paw; down: whether it is in contact.
 
-    At the first contact `air_time` still holds the length of the swing, which rewards for long swings read; it is 0
-    from the next step on. `paw_vel` is that before the contact, which stops the paw.
+    At the first contact, `air_time` is still the duration of the swing, for rewards of long swings. It is 0 from the
+    next step on. `paw_vel` is the velocity before the contact, which stops the paw.
     """
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:

@@ -14,8 +14,8 @@ def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> An
     """Return a copy of a syntax tree, or a list of them, in which loops are replaced by copies of their bodies.
 
     A loop is replaced by copies of its body, one a value, if its `wp.static` expressions depend on the loop variable.
-    An empty slice, `*p[a:a]`, is left out of a call's arguments, since Warp refuses it.
-    names: values of the function's free and global names. values: of the variables of the loops around the node.
+    An empty slice, `*p[a:a]`, is left out of a call's arguments, since Warp refuses it. names: values of the function's
+    free and global names. values: values of the loop variables around the node.
     """
     if isinstance(node, list):
         parts = [_written_out(each, names, values) for each in node]

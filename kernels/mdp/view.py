@@ -16,45 +16,45 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 @wp.struct
 class RobotView:
-    """State of one robot at the end of a policy step; legs FL, FR, BL, BR, motors of each lateral, outer, inner.
+    """State of one robot at the end of a policy step. Legs: FL, FR, BL, BR; motors of a leg: lateral, outer, inner.
 
     Bits of `collisions`: 1 shell, 2 motor housing, 4 thigh, 8 knee, 16 shank touches the ground; 32 legs touch each
     other, 64 links of one leg, 128 leg and shell.
     """
 
     world: int  # index of the world
-    pos: wp.vec3  # [m] base origin, world
-    height: float  # [m] of the base origin above the ground below it
-    quat: wp.quat  # xyzw, body to world
-    lin_vel: wp.vec3  # [m/s] base origin, world
-    prev_lin_vel: wp.vec3  # [m/s] `lin_vel` of the previous policy step
-    lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
-    ang_vel: wp.vec3  # [rad/s] body axes
-    projected_gravity: wp.vec3  # [1] direction of gravity in body axes
-    gravity_magnitude: float  # [m/s^2] downward
-    angle: vec12  # [rad] of the motors
-    sensed_angle: vec12  # [rad] `angle` as the motors' position sensors read it
-    rate: vec12  # [rad/s] of the motors
-    joint_acc: vec12  # [rad/s^2] mean of the policy step
-    torque: vec12  # [N m] last physics step
-    prev_torque: vec12  # [N m] last physics step of the previous policy step
-    action: vec12  # [1] within -1..1
-    prev_action: vec12  # [1] one policy step earlier
-    prev_prev_action: vec12  # [1] two policy steps earlier
+    pos: wp.vec3  # [m] position of the base origin, world
+    height: float  # [m] height of the base origin above the ground below it
+    quat: wp.quat  # [1] orientation of the base (xyzw), body to world
+    lin_vel: wp.vec3  # [m/s] velocity of the base origin, world
+    prev_lin_vel: wp.vec3  # [m/s] `lin_vel` of the previous policy step, world
+    lin_acc: wp.vec3  # [m/s^2] acceleration of the base origin, mean of the policy step, world
+    ang_vel: wp.vec3  # [rad/s] angular velocity of the base, body axes
+    projected_gravity: wp.vec3  # [1] direction of gravity, body axes
+    gravity_magnitude: float  # [m/s^2] downward acceleration of gravity
+    angle: vec12  # [rad] motor angles
+    sensed_angle: vec12  # [rad] motor angles with the errors of the position sensors
+    rate: vec12  # [rad/s] motor speeds: time derivatives of `angle`
+    joint_acc: vec12  # [rad/s^2] motor accelerations, mean of the policy step
+    torque: vec12  # [N m] motor torques of the last physics step
+    prev_torque: vec12  # [N m] motor torques of the last physics step in the previous policy step
+    action: vec12  # [1] action of the policy, within -1..1
+    prev_action: vec12  # [1] action one policy step earlier
+    prev_prev_action: vec12  # [1] action two policy steps earlier
     clipped: float  # [rad^2] sum over motors of the squared change of the target by the command filter
     default_angle: vec12  # [rad] motor angles of the default pose
     contacts: int  # number of paws on the ground
-    collisions: int  # bits, see above
-    contact: wp.vec4  # [1] 1: the paw is on the ground
-    first_contact: wp.vec4  # [1] 1: it touched down in this step
-    air_time: wp.vec4  # [s] since the paw left the ground; at its first contact the length of its swing, later 0
-    contact_time: wp.vec4  # [s] since the paw touched down; 0 in the air
-    touchdown_speed: wp.vec4  # [m/s] downward speed of the paw in the policy step before its last touchdown
-    paw_force: wp.vec4  # [N] on each paw, last physics step
-    peak_force: wp.vec4  # [N] on each paw, largest of the policy step
-    paw_pos: mat43  # [m] centre of each paw in a row, world
-    paw_vel: mat43  # [m/s] centre of each paw in a row, world
-    paw_height: wp.vec4  # [m] of each paw above the ground below it; 0 before the first step
+    collisions: int  # bits of all collisions
+    contact: wp.vec4  # [1] 1 for a paw on the ground, else 0
+    first_contact: wp.vec4  # [1] 1 for a paw that touched down in this step, else 0
+    air_time: wp.vec4  # [s] time since each paw left the ground; at touchdown the whole swing, later 0
+    contact_time: wp.vec4  # [s] time since each paw touched down; 0 in the air
+    touchdown_speed: wp.vec4  # [m/s] downward speed of each paw one policy step before its last touchdown
+    paw_force: wp.vec4  # [N] size of the contact force on each paw in the last physics step
+    peak_force: wp.vec4  # [N] largest contact force on each paw during the policy step
+    paw_pos: mat43  # [m] position of each paw's centre, one paw a row, world
+    paw_vel: mat43  # [m/s] velocity of each paw's centre, one paw a row, world
+    paw_height: wp.vec4  # [m] height of each paw's lowest point above the ground; 0 before the first step
 
 
 @wp.struct
@@ -121,7 +121,7 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the state of a world's robot (`RobotView`) of which only the base is read; motors and paws are 0.
+    """Return the state of a world's robot (`RobotView`) with the values of the base only; motors and paws are 0.
 
     Newton's joint_qd has the velocity of the base's centre of mass and the angular velocity in world axes; the view has
     the velocity of the origin, and the angular velocity in body axes.
@@ -258,7 +258,7 @@ def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
 
 @wp.func
 def angle_from_level(quat: wp.quat, heading: float) -> float:
-    """Return the rotation angle [rad] between an orientation (xyzw) and the level one with a yaw `heading` [rad]."""
+    """Return the angle [rad] between an orientation (xyzw) and the level orientation with a yaw `heading` [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
     turn = wp.quat_inverse(level) * quat
@@ -270,9 +270,9 @@ def in_flight(robot: RobotView, flying: bool, takeoff_speed: float) -> bool:
     """Return whether the robot is in flight after this policy step; flying: the result of the previous step.
 
     A flight begins when no paw is in contact and the base rises faster than takeoff_speed [m/s], 0.75 in the stock
-    jumps: a squat that lifts all paws is no flight. It ends when a paw is in contact and the base does not rise faster
-    than that. Contact at a higher upward speed belongs to the push-off (compliant contact can break during it) or to a
-    clipped edge.
+    jumps: a squat that lifts all paws is no flight. A flight ends when a paw is in contact and the base does not rise
+    faster than takeoff_speed. Contact at a higher upward speed belongs to the push-off (compliant contact can break
+    during it) or to a clipped edge.
     """
     rises = robot.lin_vel[2] > takeoff_speed
     if robot.contacts == 0 and rises:
@@ -293,9 +293,8 @@ def base_deceleration(robot: RobotView) -> float:
     """Return minus the base's deceleration along its previous velocity [m/s^2]; 0 if it speeds up.
 
     Plastic contact can stop the base within a step: the velocity before the step, not the one after, has the direction
-    of the impact.
-    It is a mean of the policy step, <= 0. A rebound does not count: at most the whole previous speed is lost within a
-    policy step.
+    of the impact. The value is a mean of the policy step, <= 0. A rebound does not count: the largest loss in a policy
+    step is the whole previous speed.
     """
     speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:

@@ -56,8 +56,8 @@ def walk_to_jump_due(robot: RobotView, state: VelocityState, requested: bool) ->
 def jump_to_walk_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
     """Return whether walking takes over from a jump: when the robot is at rest after landing, or the jump went wrong.
 
-    It does so without a request too. The jump went wrong if the robot is tilted after landing or not at rest within
-    RECOVER_STEPS, or if it has not taken off within NO_JUMP_STEPS.
+    No request is needed. The jump went wrong if the robot is tilted after landing or not at rest within RECOVER_STEPS,
+    or if it has not taken off within NO_JUMP_STEPS.
     """
     if state.phase == LANDED:
         over = at_rest(robot) or tilt(robot) > LOST_TILT or state.phase_steps >= RECOVER_STEPS

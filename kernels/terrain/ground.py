@@ -55,7 +55,7 @@ def world_ground(ground: Ground, world: int) -> Ground:
 def grown_block(ground: Ground, margin: float) -> Ground:
     """Return a copy of a world's ground whose block is larger by `margin` [m] on all four sides and at the top.
 
-    For collision checks, in which training keeps links at a distance from obstacles.
+    Collision checks use it: in a training, links must keep this distance from obstacles.
     """
     here = ground
     here.block.half += vec2(real(margin), real(margin))

@@ -36,7 +36,7 @@ class CommandRanges:
 def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
     """Return the largest commanded speeds at a curriculum level: ahead, back, side [m/s], yaw rate [rad/s].
 
-    They are linear in the level, from first to last range.
+    The speeds are linear in the level, from the first to the last range.
     """
     if ranges.levels == 0:
         return ranges.first_range
@@ -62,8 +62,8 @@ def sample_component(rng: RngStream, i: int, lower: float, upper: float, smalles
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
-    Above level 0, lateral velocity and yaw rate are scaled down with the forward speed, by an ellipse, to at least 0.2:
-    the highest speeds are commanded one at a time.
+    Above level 0, a high forward speed reduces lateral velocity and yaw rate, by an ellipse, to a factor of at least
+    0.2: commands do not combine the highest speeds.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.standing_probability:

@@ -33,6 +33,24 @@ def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
 
 
 @wp.func
+def yaw_rate_on_course(robot: RobotView, state: VelocityState, std: float, std_lin_vel: float) -> float:
+    """Reward for tracking the commanded yaw rate by robots that also track the commanded velocity.
+
+    It is phi_std of the error of the yaw rate [rad/s] times phi_std_lin_vel of the horizontal velocity error [m/s].
+    Without the second factor, a robot that stands still keeps its yaw rate best, and may never begin to walk.
+    """
+    error = velocity_error(robot, state)
+    return phi(error[2], std) * phi(wp.length(wp.vec2(error[0], error[1])), std_lin_vel)
+
+
+@wp.func
+def lin_vel_xy_l1(robot: RobotView, state: VelocityState) -> float:
+    """Penalty of the horizontal velocity error: its length [m/s], body axes. Its slope is the same at any error."""
+    error = velocity_error(robot, state)
+    return wp.length(wp.vec2(error[0], error[1]))
+
+
+@wp.func
 def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
     """Penalty of vertical motion of the base: its squared velocity along body z [m^2/s^2]."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]
@@ -58,7 +76,7 @@ def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
 def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: float = 0.0) -> float:
     """Reward for transversal motors near the default pose plus `shift` [rad] when commanded to stand.
 
-    It is phi_std of the rms offset [rad].
+    The reward is phi_std of the rms offset [rad].
     """
     if state.standing == 0:
         return 0.0
@@ -74,8 +92,8 @@ def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: 
 def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -> float:
     """Penalty of lateral motors far from the default pose: 0 near it, -1 for each motor far from it.
 
-    It is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad]. The high power leaves a range
-    free, instead of pulling toward its middle. Values are negative, so the weight is positive.
+    The penalty is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad]. The high power leaves a
+    range free, instead of pulling toward its middle. Values are negative, so the weight is positive.
     """
     total = float(0.0)
     for m in range(12):
@@ -89,8 +107,8 @@ def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -
 def transversal_position(robot: RobotView, state: VelocityState, steepness: float, shift: float) -> float:
     """Penalty of transversal motors far from the default angle plus `shift` [rad]: 0 near it, -1 for each one far off.
 
-    It is the sum over them of exp(-steepness offset^20) - 1; offset [rad]. The high power leaves a range free, instead
-    of pulling toward its middle. Values are negative, so the weight is positive.
+    The penalty is the sum over them of exp(-steepness offset^20) - 1; offset [rad]. The high power leaves a range free,
+    instead of pulling toward its middle. Values are negative, so the weight is positive.
     """
     total = float(0.0)
     for m in range(12):
@@ -126,8 +144,8 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 def clamped_rapid_stepping(robot: RobotView, state: VelocityState, threshold: float, limit: float) -> float:
     """Penalty of rapid stepping: sum over paws of exp(max(0, touchdowns in the last 0.75 s - threshold)) - 1.
 
-    It is clamped to `limit` [1]. It is the paper's form, for its own task: the clamp hides the slope of quick steps, so
-    that our tasks have `rapid_stepping`.
+    The sum is clamped to `limit` [1]. The paper's task uses this form. The clamp removes the slope for quick steps, so
+    our tasks use `rapid_stepping`.
     """
     total = float(0.0)
     for k in range(4):
@@ -145,8 +163,8 @@ def restless_stand(robot: RobotView, state: VelocityState) -> float:
 def foot_clearance(robot: RobotView, state: VelocityState, target_height: float) -> float:
     """Penalty of paws that swing above or below `target_height` [m], weighted by their horizontal speed.
 
-    It is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]. A paw is fast in
-    the middle of its swing, where it should be high, and slow where it lifts and lands.
+    The penalty is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]. A paw is
+    fast in the middle of its swing, where it should be high, and slow where it lifts and lands.
     """
     total = float(0.0)
     for k in range(4):
@@ -199,9 +217,9 @@ def shank_lean(
 ) -> float:
     """Penalty of shanks inclined by more than `threshold` [rad] from the vertical, in legs whose paw is on the ground.
 
-    It is the sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2]. A shank that
-    leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include the pitch of
-    the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
+    The penalty is the sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2]. A
+    shank that leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include
+    the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
     """
     down = wp.vec2(robot.projected_gravity[0], robot.projected_gravity[2])
     total = float(0.0)

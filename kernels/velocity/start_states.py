@@ -101,8 +101,8 @@ def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
     """Return a sampled pose and velocity of the base, with a position around `start.spot`.
 
-    The range of the vertical velocity is 0.3 times that of the horizontal ones. A `sample_base` of
-    `mdp.attempts.sample_valid_state`.
+    The range of the vertical velocity is 0.3 times the range of the horizontal velocities.
+    `mdp.attempts.sample_valid_state` calls this function as its `sample_base`.
     """
     settings = start.settings
     v = settings.lin_vel
@@ -133,8 +133,8 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
     """Return sampled motor angles and rates of leg `leg`: paw at rest on the ground, or lifted with rates 0.
 
-    It is lifted with `swing_probability`. A paw at rest on the ground under a moving base needs motor rates: its
-    velocity relative to the base is minus that of the base at the paw.
+    The paw is lifted with `swing_probability`. A paw at rest on the ground under a moving base needs motor rates:
+    relative to the base, it moves with minus the velocity of the base at the paw.
     """
     settings = start.settings
     offset = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
@@ -160,7 +160,7 @@ def write_start(
 ):  # fmt: skip
     """Write a start state of velocity tracking to world `rng.world`.
 
-    It is sampled, or with `default_pose_probability` the default pose.
+    The state is sampled, or the default pose with `default_pose_probability`.
     """
     world = rng.world
     start = VelocityStart()

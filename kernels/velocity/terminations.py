@@ -1,4 +1,4 @@
-"""Terminations of velocity tracking; `mdp.terminations` has those of all tasks."""
+"""Terminations of velocity tracking; `mdp.terminations` has the terminations that all tasks share."""
 
 import warp as wp
 
@@ -8,7 +8,7 @@ from .state import VelocityState
 
 @wp.func
 def finished(robot: RobotView, state: VelocityState) -> bool:
-    """Terminate an episode after `state.episode_steps` policy steps; never if that is 0."""
+    """Terminate an episode after `state.episode_steps` policy steps; never if this number is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps
 
 

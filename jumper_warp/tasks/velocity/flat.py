@@ -7,7 +7,8 @@ weight, which makes the robot trot without short quick steps. The penalty of rap
 clamped exponential has no slope at the start of training. Swing height, slip and touchdown speed have terms. Torques,
 joint accelerations and changes of the action are penalised (the configuration lists these weights but sets them to 0).
 Second differences of the action, which distinguish chatter from walking, are penalised too. Commands are resampled
-every few seconds, so that policies learn transients, and their range grows with the tracking score.
+every few seconds, so that policies learn transients, and their range grows with the tracking score. The narrow reward
+of turning pays only robots near the commanded velocity, or some learn to turn on the spot and never to walk.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.5, std=0.5),
     RewardTerm(rewards.linear_velocity, 2.0, name="linear_velocity_fine", std=0.1),
     RewardTerm(rewards.yaw_rate, 1.5, std=0.5),
-    RewardTerm(rewards.yaw_rate, 4.3, name="yaw_rate_fine", std=0.1),
+    RewardTerm(rewards.yaw_rate_on_course, 4.3, name="yaw_rate_fine", std=0.1, std_lin_vel=0.5),
     RewardTerm(rewards.lin_vel_z_l2, -1.0),
     RewardTerm(rewards.ang_vel_xy_l2, -0.1),
     RewardTerm(rewards.flat_orientation_l2, -50.0),

@@ -82,9 +82,9 @@ def make_leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power is differentiated: multipliers, motion, contact.
 
-    rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s]. virtual_rates, law:
+    rates, new_rates [rad/s] of the motors at the start and the end of the step of dt [s]. virtual_rates, law:
     multipliers of the motors' equations and of the contact law. mode: SEPARATE, STICK or SLIDE. pressed: set of pressed
-    hard stops. impulse [N s]: on the paw, body axes; push: gradient of the loss w.r.t. it, world axes.
+    hard stops. impulse [N s]: on the paw, body axes. push: gradient of the loss w.r.t. the impulse, world axes.
     """
     factors = LegFactors()
     factors.virtual_rates = virtual_rates
@@ -106,8 +106,8 @@ def leg_action_gradient(
 ) -> LegGradient:  # fmt: skip
     """Return the gradient of a leg's virtual power in a step (`leg_action`) w.r.t. its state and constants.
 
-    leg: 0 to 3. dt [s]: of the step. mu: friction coefficient. base, angles [rad], rates [rad/s]: at the start of the
-    step. base_held, leg_held: constants of the differentiation.
+    leg: 0 to 3. dt: duration of the step [s]. mu: friction coefficient. base, angles [rad], rates [rad/s]: values at
+    the start of the step. base_held, leg_held: constants of the differentiation.
     """
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     gradient = LegGradient()
@@ -141,8 +141,8 @@ def base_action_gradient(
 ) -> BaseGradient:  # fmt: skip
     """Return the gradient of the base's virtual power in a step (`base_action`) w.r.t. its state, mass and forces.
 
-    dt [s]: of the step. held, cotangent: constants of the differentiation. force [N], moment [N m]: at the com, world
-    axes. base: at the start of the step.
+    dt: duration of the step [s]. held, cotangent: constants of the differentiation. force [N], moment [N m]: at the
+    com, world axes. base: state at the start of the step.
     """
     body, com, gravity, force_adj, moment_adj, quat_adj, lin, omega, _held, _cotangent, _dt = wp.grad(base_action)(
         load_moments(model.table, BASE, world), base_com(model.table, world), load_vec3(model.table, GRAVITY, world),

@@ -1,9 +1,9 @@
-"""Reverse pass of motors, latency and command filter: gradients w.r.t. targets and constants from those of torques.
+"""Reverse pass of motors, latency and command filter: from gradients w.r.t. torques to targets and constants.
 
 Motors are 0 to 11 (legs FL, FR, BL, BR; each lateral, outer, inner). A cotangent is the gradient of the loss w.r.t. a
-result, from which the gradient w.r.t. the inputs follows. `sums` and `shared` take gradients w.r.t. parameters: those
-of one leg or motor, and those that all motors of a world share. On a GPU they differ in the threads that are summed
-over first (`ThreadSums`); on a CPU both are the same array of one world.
+result, from which the gradient w.r.t. the inputs follows. `sums` takes gradients w.r.t. parameters of one leg or motor,
+`shared` gradients w.r.t. parameters that all motors of a world share. On a GPU, the two are first summed over different
+threads (`ThreadSums`). On a CPU, both are the same array of one world.
 """
 
 from typing import Any
@@ -44,8 +44,8 @@ class FilterAdjoint:
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
     """Add a number to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
 
-    A motor follows a target in several physics steps, each of which adds its part. step: policy step, -1 for the
-    initial target, which a motor follows until the first one arrives.
+    A motor follows a target in several physics steps, and each of these adds its part. step: policy step; -1 for the
+    initial target, which a motor follows until the first target arrives.
     """
     if step < 0:
         # atomic to avoid a load: no other thread writes here
@@ -85,7 +85,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Add the gradient w.r.t. a motor's interpolated target, by weight, to those w.r.t. the two targets around it."""
+    """Distribute the gradient w.r.t. a motor's interpolated target, by weight, to the two targets around it."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
@@ -95,9 +95,10 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
     """Add a physics step's gradient of the loss w.r.t. a motor's constants and latency to the stored gradients.
 
-    By the chain rule it is `cotangent`, the gradient w.r.t. the motor's torque, times the torque's derivatives in
-    `adjoint`. Gains, limits and sensor offset belong to one motor and go to `sums`. Over-speed limits and latency are
-    common to a world's motors and go to `shared`. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
+    By the chain rule, this gradient is `cotangent`, the gradient w.r.t. the torque of the motor, times the derivatives
+    of the torque in `adjoint`. `sums` gets gains, limits and sensor offset, which belong to one motor. `shared` gets
+    over-speed limits and latency, which the motors of a world share. sums, shared: rows of GRADIENT_ROWS, see
+    `add_entry`.
     """
     add_motor(sums, shared, motor, cotangent, adjoint.constants)
     add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
@@ -116,8 +117,8 @@ def filter_gradient(
 ) -> FilterAdjoint:  # fmt: skip
     """Return the gradient of the loss w.r.t. the inputs of a leg's command filter (`filter_leg`) in a policy step.
 
-    Reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at
-    the start of the policy step. Without a filter the gradient passes to the target unchanged.
+    The function reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s] of the
+    leg's motors at the start of the policy step. Without a filter the gradient passes to the target unchanged.
     """
     m = 3 * leg
     adjoint = FilterAdjoint()
@@ -141,7 +142,7 @@ def filter_gradient(
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
     """Add the gradient w.r.t. a leg's measured angles to the gradient w.r.t. its position sensors' offsets.
 
-    A measured angle is the true one plus the offset, so both have the same gradient. The offsets' rows follow six
+    A measured angle is the true angle plus the offset, so both have the same gradient. The offsets' rows follow six
     constants of all 12 motors.
     """
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

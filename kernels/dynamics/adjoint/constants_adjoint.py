@@ -1,8 +1,8 @@
 """GPU kernels that add a rollout's gradient of the loss w.r.t. leg and motor constants, all steps in parallel.
 
-They read the multipliers that `reverse_legs_kernel` has recorded. With these, no step depends on another one any more:
-a thread takes every n-th step, and the threads' sums are added up. A trajectory has a row every `timing.every` physics
-steps; a `Span` is a range of rows, whose steps are in a `LegRecord`, one entry a step.
+The kernels read the multipliers that `reverse_legs_kernel` has recorded. With these multipliers, the steps are
+independent: a thread takes every n-th step, and the sums of the threads are added. A trajectory has a row every
+`timing.every` physics steps; a `Span` is a range of rows, whose steps are in a `LegRecord`, one entry a step.
 """
 
 import warp as wp
@@ -41,7 +41,7 @@ def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
     """Return physics step k (from 0) of a range of trajectory rows; beyond the range, the last step with weight 0.
 
-    All threads of a warp must take part in its sums, also those that have no step left.
+    All threads of a warp must take part in its sums, also threads without a step.
     """
     step = SpanStep()
     end = span.end * timing.every

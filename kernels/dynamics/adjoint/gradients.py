@@ -67,8 +67,8 @@ class ThreadSums:
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
     """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1.
 
-    The caller sets the weight 0 where a thread repeats a step of another one only to take part in the warp's sums.
-    writes, over_steps, over_legs: see `ThreadSums`.
+    The caller sets the weight 0 if a thread repeats the step of another thread, only to take part in the sums of the
+    warp. writes, over_steps, over_legs: see `ThreadSums`.
     """
     sums = ThreadSums()
     sums.parameters = gradients.parameters
@@ -184,10 +184,10 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 
 @wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
-    """Add the gradient w.r.t. the base's centre of mass to those w.r.t. its mass and first moment, by the chain rule.
+    """Add the gradient w.r.t. the base's centre of mass, by the chain rule, to its mass and first moment.
 
-    gradient: w.r.t. com [m]. mass [kg]: of the base. The table holds the mass and the first moment mass * com, and com
-    is their quotient.
+    gradient: w.r.t. com [m]. mass [kg] of the base. The table has the mass and the first moment, mass * com; their
+    quotient is com.
     """
     add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)
     add_vec3(sums, layout.BASE + 1, gradient / mass)
@@ -213,7 +213,7 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient w.r.t. the command filter's limits of one angle or sum to `sums`; that of hard zones is 0."""
+    """Add the gradient w.r.t. the command filter's limits of one angle or sum to `sums`; hard zones have gradient 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 

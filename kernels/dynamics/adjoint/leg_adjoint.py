@@ -76,7 +76,7 @@ def replay_leg(
     model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
-    """Recompute one physics step of a rollout, with a thread per leg, and record what the reverse pass needs of it.
+    """Recompute one physics step of a rollout, with a thread per leg, and record its values for the reverse pass.
 
     Starts from the state in entry i of the record and writes the state at the end of the step to entry i + 1. Entry i
     stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]: on the
@@ -137,7 +137,7 @@ def replay_leg(
 
 @wp.func
 def any_leg(flag: bool) -> bool:
-    """Return whether any of the four threads (legs) of the world sets the flag; all four get the same answer."""
+    """Return whether any of the four threads (legs) of the world sets the flag; all four get the same result."""
     return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
 
 
@@ -145,8 +145,8 @@ def any_leg(flag: bool) -> bool:
 def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
     """Return the 3x3 block (paw `leg`, paw j) of the matrix from which the contact-law multipliers are solved.
 
-    The matrix is A^T of `step_adjoint`. The arguments but j are those of this thread's leg. sent, sent_law: c and law
-    again, of which thread j sends its own to the other threads.
+    The matrix is A^T of `step_adjoint`. All arguments except j belong to the leg of this thread. sent, sent_law: c and
+    law again; thread j sends its values to the other threads.
     """
     to_lin = mat_from_leg(sent.to_lin * wp.transpose(sent_law.by_velocity), j)
     to_ang = mat_from_leg(sent.to_ang * wp.transpose(sent_law.by_velocity), j)
@@ -232,8 +232,8 @@ def leg_factors(
 ) -> LegFactors:  # fmt: skip
     """Return the values held constant while a leg's virtual power in a recorded step is differentiated.
 
-    Its acceleration follows from the rates of this entry and the next. step: its number in the rollout; dt [s]; i: its
-    entry in the record.
+    The acceleration of the motors follows from the rates of this entry and the next. step: number of the step in the
+    rollout; dt [s]; i: entry of the step in the record.
     """
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
@@ -262,8 +262,9 @@ def find_weights(
 ) -> StepWeights:  # fmt: skip
     """Return adjoint multipliers of a step's motion and contact equations, from gradients w.r.t. its end velocities.
 
-    Like `find_multipliers`, with a thread per leg. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, in the
-    body axes of the step's start. rate_cotangent: w.r.t. the motors' rates. i: the step's entry in the record.
+    The function equals `find_multipliers`, with a thread per leg. lin_cotangent, ang_cotangent: gradients w.r.t. the
+    velocities of the base, in the body axes at the start of the step. rate_cotangent: gradient w.r.t. the rates of the
+    motors. i: entry of the step in the record.
     """
     inverse = leg_record.get_inverse(record, i, world)
     solve = leg_record.get_solve(record, i, world, leg)
@@ -358,7 +359,7 @@ def reverse_leg(
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
     """Add a step's gradient of the loss w.r.t. all constants of a leg, friction coefficients included, to `sums`.
 
-    Both rows of friction are added to, one of them 0, since all threads of a warp must make the same calls.
+    The function adds to both rows of friction, to one of them 0, since all threads of a warp must make the same calls.
     """
     add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # the step depends on one of the two coefficients

@@ -1,9 +1,9 @@
 """Record of a few recomputed physics steps, for the reverse pass of a rollout with a thread per leg.
 
-The reverse pass needs values of every step, such as inverse inertias, that would take too much memory for a whole
-rollout: the steps of a few trajectory rows at a time are recomputed and recorded here. `get_*` and `put_*` read and
-write the fields of one entry (a step) and world; indices of world and leg come last for coalesced access. A multiplier
-is a solution of the step's transposed equations, one number per equation (`step_adjoint`).
+The reverse pass needs values of every step, such as inverse inertias. For a whole rollout they would take too much
+memory. Therefore the steps of a few trajectory rows at a time are recomputed and recorded here. `get_*` and `put_*`
+read and write the fields of one entry (a step) and world; indices of world and leg come last for coalesced access. A
+multiplier is a solution of the step's transposed equations, one number per equation (`step_adjoint`).
 """
 
 import warp as wp
@@ -59,7 +59,8 @@ class BaseWeights:
 class LegWeights:
     """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step.
 
-    The pass backwards in time solves them; the kernels of `constants_adjoint` read them, all steps in parallel.
+    The pass backwards in time computes these multipliers. The kernels of `constants_adjoint` read them, for all steps
+    in parallel.
     """
 
     rates: vec3  # virtual rates of the motors
@@ -194,7 +195,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return recorded matrices of a leg's motor accelerations as a function of the base's; its offset `free` is 0."""
+    """Return the recorded matrices of a leg's motor accelerations by the base's acceleration; `free` is 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -204,9 +205,9 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Record matrices of a leg's motor accelerations as a function of the base's, but not its offset `free`.
+    """Record the matrices of a leg's motor accelerations as a function of the base's acceleration, without the offset.
 
-    The transposed equations, which the reverse pass solves, have the same matrices, and another right-hand side.
+    The reverse pass solves the transposed equations, with the same matrices and another right-hand side.
     """
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
@@ -250,7 +251,7 @@ def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
 
 @wp.func
 def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
-    """Write a paw's contact (impulse and derivatives) to the reverse pass' record; without contact, only its mode."""
+    """Write a paw's contact (impulse and derivatives) to the record; without contact, only its mode."""
     record.legs[entry, MODE, world, leg] = real(law.mode)
     if law.mode != SEPARATE:
         record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)

@@ -82,9 +82,9 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Return the adjoint multipliers of the base's equations of motion, and write those of the motors to `legs`.
+    """Return the adjoint multipliers of the base's equations of motion, and write the motors' multipliers to `legs`.
 
-    Solves M m = y (`Multipliers`) for y = *_cotangent, `legs[k].rates`. Laws of contact are not part of it.
+    The system is M m = y (`Multipliers`) with y = *_cotangent, `legs[k].rates`. It contains no contact laws.
     """
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
@@ -111,8 +111,9 @@ def replay_step(
 ):  # fmt: skip
     """Recompute one physics step of a rollout, for its reverse pass, with the recorded torques, impulses and stops.
 
-    The step starts from its entry of the record; torques, impulses and pressed stops are those of the trajectory.
-    Writes to `record` the leg and base terms of the step (entry `at.entry`) and the state at its end (the next entry).
+    The step starts from its entry of the record. The trajectory has its torques, impulses and pressed stops. The
+    function writes the leg and base terms of the step (entry `at.entry`) and the state at its end (the next entry) to
+    `record`.
     """
     dt, world, step, i = at.dt, at.world, at.step, at.entry
     base = record.base[world, i]
@@ -193,8 +194,9 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 def solve_laws(legs: wp.array(dtype=LegReverse)):
     """Solve for the adjoint multipliers of all paws' contact laws, one linear system, by Gaussian elimination.
 
-    The system is A^T l = -(gradient w.r.t. the impulses), see `step_adjoint`; paws couple through the base.
-    `multiplier` of each leg is the gradient w.r.t. its paw's impulse before, and the multiplier (0 if separated) after.
+    The system is A^T l = -(gradient w.r.t. the impulses), see `step_adjoint`; paws couple through the base. Before the
+    call, `multiplier` of each leg is the gradient w.r.t. the impulse of its paw. After the call, it is the multiplier
+    (0 if separated).
     """
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
@@ -276,8 +278,9 @@ def add_laws(
 ) -> Multipliers:  # fmt: skip
     """Add the contribution of the paws' contact laws to the adjoint multipliers of the equations of motion.
 
-    A law's multiplier acts like a gradient y w.r.t. the contact point's velocity, and is passed on to base and motors.
-    Returns the base's multipliers; updates the motors' in `legs`, which holds the laws.
+    The multiplier of a law acts like a gradient y w.r.t. the velocity of the contact point, and is passed to base and
+    motors. The function returns the multipliers of the base, and updates the multipliers of the motors in `legs`, which
+    also has the laws.
     """
     m = multipliers
     law_lin = vec3(real(0.0))
@@ -309,9 +312,9 @@ def find_multipliers(
 ) -> Multipliers:  # fmt: skip
     """Return adjoint multipliers of a step's motion and contact equations, from gradients w.r.t. its end velocities.
 
-    See `step_adjoint`. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, body axes. legs: `rates` are the
-    gradients w.r.t. the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are
-    written.
+    See `step_adjoint`. lin_cotangent, ang_cotangent: gradients w.r.t. the velocities of the base, body axes. legs:
+    `rates` are the gradients w.r.t. the rates of the motors, to which the function adds the part of the contact laws.
+    It writes multipliers, contacts and laws.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):

@@ -1,8 +1,8 @@
 """Reverse pass of a rollout: all its steps in one launch, with one thread per world.
 
-The rows are visited backwards: the steps between two rows are recomputed with the impulses of the rollout, then run
-backwards one by one (`step_adjoint`, `virtual_power`). Storing only rows saves memory, and given impulses save the
-contact iteration.
+The pass goes backwards from row to row. It recomputes the steps between two rows with the impulses of the rollout, then
+differentiates them one by one, backwards (`step_adjoint`, `virtual_power`). Storing only rows saves memory, and known
+impulses save the contact iteration.
 
 A row holds the base's position and orientation (xyzw), velocity of its centre of mass and angular velocity (world
 axes), then the motors (lateral, outer, inner of FL, FR, BL, BR); `BaseState` has the velocity of the origin and the
@@ -61,7 +61,7 @@ def store_adjoint_scalar(
 ) -> real:
     """Return a scalar whose gradient (`wp.grad`) is the adjoint of `store_row_base`: dot(cotangents, velocities).
 
-    orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
+    orientation (xyzw), lin [m/s], omega [rad/s] of the `BaseState`; com [m]: body frame; cotangents: world axes.
     """
     ang = wp.quat_rotate(orientation, omega)
     return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
@@ -84,8 +84,8 @@ def load_row_base_adjoint(
 ) -> RowCotangent:
     """Return the gradient w.r.t. a trajectory row's base entries: the adjoint of `load_row_base`.
 
-    adj: gradient w.r.t. the base's state that was read from the row. later_com: gradient w.r.t. the base's centre of
-    mass, which converts the velocities of rows, summed over the later rows.
+    adj: gradient w.r.t. the base's state that was read from the row. later_com: gradient w.r.t. the centre of mass of
+    the base, summed over the later rows; the centre of mass converts the velocities of rows.
     """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
@@ -129,7 +129,7 @@ class RowBaseAdjoint:
 def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
     """Return the gradient w.r.t. the base state that was written to a trajectory row: the adjoint of `store_row_base`.
 
-    base: that state. cotangent: gradient w.r.t. the row's entries.
+    base: the written state. cotangent: gradient w.r.t. the entries of the row.
     """
     com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
@@ -148,7 +148,8 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
     """Add the gradient of the loss w.r.t. motor angles and rates of a trajectory row, from `cotangent`, to `legs`.
 
-    It is the direct effect of the row on the loss; `legs` holds that through later rows. Empty arrays mean 0.
+    `cotangent` is the direct effect of the row on the loss; `legs` has the effect through later rows. Empty arrays mean
+    0.
     """
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
@@ -185,7 +186,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Recompute and record the `every` physics steps between two trajectory rows; com [m]: of the base, body frame."""
+    """Recompute and record the `every` physics steps between two trajectory rows; com [m] of the base, body frame."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
@@ -201,7 +202,8 @@ def replay_row(
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
     """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t.
 
-    The wrench is constant in a policy step, whose physics steps each add their part. World axes, at the base's COM.
+    The wrench is constant in a policy step, and each physics step adds its part. World axes, at the centre of mass of
+    the base.
     """
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
@@ -239,10 +241,10 @@ def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Store the gradient w.r.t. leg k's targets in policy step t, and add those w.r.t. other inputs of its filter.
+    """Store the gradient w.r.t. leg k's targets in policy step t, and add the gradients of its filter's other inputs.
 
-    by_filter: these gradients. Those w.r.t. targets are stored in `gradients`, those w.r.t. angles and rates are added
-    to `legs`, and those w.r.t. filter constants and sensor offsets to `sums`.
+    by_filter: all these gradients. The gradients w.r.t. targets are stored in `gradients`. The gradients w.r.t. angles
+    and rates are added to `legs`, and the gradients w.r.t. filter constants and sensor offsets to `sums`.
     """
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
     command_adjoint.add_offsets(sums, k, by_filter.angles)
@@ -285,7 +287,7 @@ def reverse_kernel(
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Compute the gradient of a loss w.r.t. all inputs of a rollout, from that w.r.t. its trajectory; thread per world.
+    """Compute the gradient of a loss w.r.t. all inputs of a rollout; one thread per world.
 
     cotangent: gradient w.r.t. the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
     `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
@@ -349,7 +351,7 @@ def adjoint_roots(
 ) -> real:  # fmt: skip
     """Call all functions that the reverse pass differentiates, so that Warp generates their adjoints; return a dummy.
 
-    It is the sum of the results, which has no meaning; see `generate_adjoints`.
+    The dummy is the sum of the results, which has no meaning; see `generate_adjoints`.
     """
     params = load_leg(model, world, 0)
     v = row_vec3(trajectory.q, 0, 0, world)

@@ -6,7 +6,8 @@ two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all step
 the record; `gradients.q` and `gradients.qd` carry the gradient from one span to the next.
 
 A trajectory has a row every `timing.every` physics steps. A cotangent is the gradient of the loss w.r.t. a result.
-Kernels launch full warps of eight worlds, whose threads exchange values: those beyond the last world repeat it.
+Kernels launch full warps of eight worlds, whose threads exchange values: threads beyond the last world repeat the last
+world.
 """
 
 import warp as wp
@@ -178,10 +179,10 @@ def reverse_legs_kernel(
 ):
     """Backpropagate through the physics steps of a range of trajectory rows (`span`), with a thread per leg.
 
-    Launch over (count rounded up to a multiple of 8, 4). gradients.q and gradients.qd hold the gradient w.r.t. the row
-    after the span, and are replaced by that w.r.t. its first row. Adds the gradients w.r.t. the parameters of base,
-    gravity and filter. count: number of worlds, from `settings.first` on; threads beyond the last world repeat it and
-    write nothing.
+    Launch over (count rounded up to a multiple of 8, 4). Before the launch, gradients.q and gradients.qd have the
+    gradient w.r.t. the row after the span; after the launch, w.r.t. its first row. The kernel also adds the gradients
+    w.r.t. the parameters of base, gravity and filter. count: number of worlds, from `settings.first` on; threads beyond
+    the last world repeat it and write nothing.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)

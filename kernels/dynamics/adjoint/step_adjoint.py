@@ -1,4 +1,4 @@
-"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to that w.r.t. its inputs.
+"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to the gradient w.r.t. its inputs.
 
 The step solves M (v' - v) = dt f + J^T p for the velocities v' at its end, with impulses p that satisfy the contact law
 R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by v' and z by p, the multipliers l, m are
@@ -7,8 +7,8 @@ R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by 
     m = M^-1 (y + J^T (dR/dv')^T l)
 
 and the gradient with respect to all else, the old velocities aside, is that of m . (dt f + J^T p - M (v' - v)) + l . R
-at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion has a kink; the gradient is that of the
-mode in the forward pass.
+at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion has a kink; the gradient belongs to the
+mode of the forward pass.
 """
 
 import warp as wp
@@ -43,8 +43,8 @@ def add_leg_gradient(
     """Add the gradient of leg k's virtual power w.r.t. its motors to `legs`, and w.r.t. its parameters to `sums`.
 
     Also writes the gradient w.r.t. the motors' torques to `legs`: dt times the multipliers, since torques enter the
-    equations as dt f. dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters; of
-    the two friction coefficients the step depends on the one in `mu_row`.
+    equations as dt f. dt: duration of the step [s]. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t.
+    parameters. mu_row: row of the friction coefficient in this step.
     """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:
@@ -64,8 +64,8 @@ def reverse_step(
 
     adj: gradient w.r.t. the base's state at the end. legs (4,): gradients w.r.t. `angles` and `rates` at the end are
     replaced by those at the start, `torque` is written, the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t.
-    parameters, added to. first_impulse: as in `Commands`. trajectory, cotangent: of the rollout, and the gradient
-    w.r.t. it. record: written by `replay_step`.
+    parameters, added to. first_impulse: as in `Commands`. trajectory of the rollout; cotangent: gradient w.r.t. the
+    trajectory. record: written by `replay_step`.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]

@@ -44,7 +44,7 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 class BaseFactors:
     """Adjoint multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
 
-    Axes are those of the base at the start of the step.
+    The axes are the body axes at the start of the step.
     """
 
     virtual_lin: vec3  # multipliers of the base's linear equations
@@ -59,7 +59,7 @@ class BaseFactors:
 class LegFactors:
     """Adjoint multipliers, motor motion and contact of a leg, constant while its virtual power is differentiated.
 
-    Vectors are lateral, outer, inner, or those of its paw's contact.
+    Vectors are lateral, outer, inner, or belong to the contact of the paw.
     """
 
     virtual_rates: vec3  # multipliers of the motors' equations
@@ -179,11 +179,11 @@ def planar_cross(a: vec3, b: vec3) -> real:
 def link_motion(
     housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real
 ) -> FrameMotion:
-    """Return motion and virtual velocity of a link's frame from those of its leg's motor housing, in the link's axes.
+    """Return motion and virtual velocity of a link's frame, in its axes, from the motion of its leg's motor housing.
 
-    origin [m], vel [m/s], acc [m/s^2], virtual velocity: of the link frame's origin relative to the housing, in housing
+    origin [m], vel [m/s], acc [m/s^2], virtual velocity of the link frame's origin relative to the housing, in housing
     axes; the last three in the five-bar's plane, (x, z). about_y: the link's rate [rad/s], acceleration [rad/s^2] and
-    virtual rate about +y. cosine, sine: of the link's rotation about +y.
+    virtual rate about +y. cosine, sine of the link's rotation about +y.
     """
     w = housing.ang
     link = FrameMotion()
@@ -263,8 +263,8 @@ def housing_motion(
 ) -> FrameMotion:
     """Return motion and virtual velocity of a leg's motor housing frame, in housing axes.
 
-    rate [rad/s]: of the lateral motor. omega [rad/s], g [m/s^2]: of the base, body axes. c, s: cosine and sine of the
-    housing's rotation about body x.
+    rate [rad/s] of the lateral motor. omega [rad/s], g [m/s^2]: rotation of the base and gravity, body axes. c, s:
+    cosine and sine of the housing's rotation about body x.
     """
     zero = real(0.0)
     lateral_rate = geo.side * rate
@@ -299,8 +299,8 @@ def contact_action(
 ) -> real:  # fmt: skip
     """Return the virtual power of one paw's contact in a step, for the reverse pass to differentiate.
 
-    It is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
-    orientation (xyzw): of the base, world, at the start of the step dt [s].
+    The power is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
+    orientation (xyzw) of the base, world, at the start of the step dt [s].
     """
     centre = pos + wp.quat_rotate(orientation, paw.position)
     normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
@@ -324,8 +324,8 @@ def leg_action(
 ) -> real:  # fmt: skip
     """Return a leg's part of a step's virtual power: links, passive forces, spring and contact, without motor torques.
 
-    mu: friction coefficient. pos [m], orientation (xyzw): of the base, world. omega: its angular velocity [rad/s], g:
-    gravity [m/s^2], both in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
+    mu: friction coefficient. pos [m], orientation (xyzw) of the base, world. omega [rad/s] of the base and gravity g
+    [m/s^2] are in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
     """
     zero = real(0.0)
     pose = leg_pose(geo, angles)
@@ -399,8 +399,9 @@ def base_action(
 ) -> real:  # fmt: skip
     """Return the base's part of a step's virtual power, plus dot products that backpropagate through changes of axes.
 
-    These are of `cotangent` with gravity and velocities, in the axes of `BaseCotangent`. gravity [m/s^2], external
-    force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body axes; orientation: xyzw.
+    The dot products are between `cotangent` and gravity and velocities, in the axes of `BaseCotangent`. gravity
+    [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body axes;
+    orientation: xyzw.
     """
     g = wp.quat_rotate_inv(orientation, gravity)
     frame = FrameMotion()
@@ -424,6 +425,6 @@ def base_action(
 def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
     """Return a scalar whose gradient (`wp.grad`) is the adjoint of integrating the base's orientation over dt [s].
 
-    It is cotangent . (orientation after dt at ang [rad/s], body axes).
+    The scalar is cotangent . (orientation after dt at ang [rad/s], body axes).
     """
     return wp.dot(cotangent, wp.normalize(orientation * exp_rotation(dt * ang)))

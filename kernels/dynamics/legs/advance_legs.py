@@ -10,7 +10,7 @@ worlds of a warp continue.
 Motors of a leg are lateral, outer, inner. A hard stop limits a motor's angle, or the sum of outer and inner; pressed
 stops change a leg's inertia, so that a step must assume a set of them before it is solved. `pressed` is such a set, one
 int of two bits per angle, 0: none. `sum_*`, `max_legs`, `first_leg`, `from_leg` exchange values among the four threads
-of a world, `any_world` among those of a warp; all threads must call them together.
+of a world, `any_world` among the threads of a warp. All threads must call them together.
 
 Velocities `lin` and `ang` of the base are in its axes at the start of a step, forces and moments on it in world axes.
 """
@@ -134,9 +134,10 @@ class StopAttempt:
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
     """Return the set of hard joint stops to assume pressed in a leg's next attempt at a step of dt [s] from `old`.
 
-    It is `old.pressed`: the preceding step's set, as stops often stay pressed for many steps, or after a rejected
-    attempt the set that attempt asked for. If the preceding step had none, the first attempt assumes the stops that the
-    leg would pass at its present rates. Limits are read only if a stop may matter, since most legs are far from all.
+    The first attempt assumes the set of the preceding step, since stops often stay pressed for many steps. After a
+    rejected attempt, the set is the one that this attempt required; both are in `old.pressed`. If the preceding step
+    had no pressed stops, the first attempt assumes the stops that the leg would pass at its present rates. Most legs
+    are far from all stops: limits are read only if a stop may matter.
     """
     attempt = StopAttempt()
     attempt.pressed = old.pressed
@@ -155,7 +156,7 @@ def required_stops(
 ) -> int:
     """Return which hard joint stops a leg must press, given the motor rates at which an attempted step ended.
 
-    The attempt was right if that is the set it assumed. It had the set `pressed` and ended at `rates` [rad/s]. angles
+    The attempt is valid if it assumed the same set. It assumed the set `pressed` and ended at `rates` [rad/s]. angles
     [rad]: at the start of the step. sets: number of sets tried. The limits are reloaded to save registers.
     """
     limits = load_stops(model.table, leg, world)
@@ -173,8 +174,8 @@ def completed_step(
 ) -> LegState:  # fmt: skip
     """Return a thread's state after a completed physics step, from its state `old` before it and the step's results.
 
-    base, angles [rad], rates [rad/s]: at the end. torque [N m]: of the motors in the step. total [N s]: sum of the
-    paws' impulses. pressed: set of hard stops that the leg presses.
+    base, angles [rad], rates [rad/s]: values at the end. torque [N m] of the motors in the step. total [N s]: sum of
+    the paws' impulses. pressed: set of hard stops that the leg presses.
     """
     new = old
     new.base = base
@@ -196,8 +197,8 @@ def completed_step(
 def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
     """Return a thread's state to try the same physics step again with another set of pressed joint stops.
 
-    From the state `old`; the set is `required`, or one change toward it. pressed: the set just tried. changes: whether
-    this leg is the one to change where only one may (`one_by_one`).
+    The new attempt starts from the state `old`, with the set `required` or with one change toward it. pressed: set of
+    the last attempt. changes: whether this leg may change if only one leg may (`one_by_one`).
     """
     new = old
     new.sets = old.sets + 1
@@ -216,8 +217,9 @@ def advance_leg(
 ) -> LegState:  # fmt: skip
     """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other stops for a retry.
 
-    A world that has completed all its steps keeps its state. It computes as the others do, since threads of a warp must
-    exchange values together. params, motors: of this thread's leg. writes: whether this thread moves its world's block.
+    A world that has completed all its steps keeps its state, but computes the step, since all threads of a warp must
+    exchange values. params, motors: constants of this thread's leg. writes: whether this thread moves its world's
+    block.
     """
     dt = settings.dt
     blocks = model.ground.blocks.shape[0] > 0

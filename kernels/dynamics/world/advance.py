@@ -26,10 +26,10 @@ def advance_once(
 ) -> BaseState:  # fmt: skip
     """Advance one world by one physics step, motors, contacts and block included; return the new base state.
 
-    The step takes `settings.dt`; `legs` and `contacts` are overwritten. step: of the launch, from 0; the last one
-    writes torques and paw forces to `work`. legs, contacts (4,): the thread's scratch, see `solve_step`; `angles` and
-    `rates` of the legs are input, and are replaced by those at the end of the step. Also moves the world's block in
-    `model.ground` and updates impulses and peak values in `work`.
+    The step takes `settings.dt`; `legs` and `contacts` are overwritten. step: number of the step in the launch, from 0;
+    the last step writes torques and paw forces to `work`. legs, contacts (4,): scratch of the thread, see `solve_step`.
+    `angles` and `rates` of the legs are input, and are replaced by their values at the end of the step. The function
+    also moves the block of the world in `model.ground`, and updates impulses and peak values in `work`.
     """
     dt = settings.dt
     last = step == settings.substeps - 1

@@ -93,10 +93,10 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Replace each leg's active set of hard stops by the one its new rates require; return whether any set changed.
+    """Replace each leg's active set of hard stops by the set that its rates require; return whether any set changed.
 
-    After many tries (`one_by_one`) only one stop of one leg changes. slack [rad/s]: a stop changes only beyond it;
-    sets: number of sets tried in this step.
+    After many tries (`one_by_one`) only one stop of one leg changes. slack: a stop changes only if a rate exceeds it
+    [rad/s]; sets: number of sets tried in this step.
     """
     changed = bool(False)
     for k in range(legs.shape[0]):
@@ -119,9 +119,9 @@ def solve_step(
 
     Writes every leg's pressed stops, contact and motor rates at the end of the step. force [N], moment [N m]: external,
     at the base's com, world axes. impulse: first guess [N s], world axes, (4, num_worlds). legs, contacts: local to the
-    thread, (4,); `angles`, `rates`, `torque` and `pressed` of the legs are read, and all else but `peak_sq` is
-    written. The first set tried is the one of the preceding step or, if that is empty, the stops that the rates at the
-    start would press.
+    thread, (4,); `angles`, `rates`, `torque` and `pressed` of the legs are read, and all else but `peak_sq` is written.
+    The first set is the set of the preceding step or, if it is empty, the stops that the rates at the start would
+    press.
     """
     dt = settings.dt
     for k in range(legs.shape[0]):

@@ -17,9 +17,9 @@ from jumper_warp.tasks.velocity.paper import velocity_paper
 from jumper_warp.tasks.velocity.rough import velocity_rough
 from mdp_helpers import DEFAULT_ANGLE
 
-NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
-transversal_position air_time rapid_stepping clamped_rapid_stepping restless_stand foot_clearance slip touchdown
-torque_sign_changes trot_schedule shank_lean"""
+NAMES = """linear_velocity yaw_rate yaw_rate_on_course lin_vel_xy_l1 lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2
+standing_posture lateral_position transversal_position air_time rapid_stepping clamped_rapid_stepping restless_stand
+foot_clearance slip touchdown torque_sign_changes trot_schedule shank_lean"""
 reward = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
@@ -116,9 +116,19 @@ def offset(r):
     return r["angle"] - DEFAULT_ANGLE
 
 
+def error(r):
+    """Return velocity ahead, to the left [m/s] and yaw rate [rad/s] less the command (3,)."""
+    return np.array([*r["vel"][:2], r["ang_vel"][2]]) - r["command"]
+
+
 EXPECTED = {  # name of a reward: its numbers, and its value for the fields of a `Sample`
     "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
     "yaw_rate": ({"std": 0.5}, lambda r: np.exp(-((r["ang_vel"][2] - r["command"][2]) ** 2) / 0.25)),
+    "yaw_rate_on_course": (
+        {"std": 0.5, "std_lin_vel": 1.5},
+        lambda r: np.exp(-4.0 * error(r)[2] ** 2 - np.sum(error(r)[:2] ** 2) / 2.25),
+    ),
+    "lin_vel_xy_l1": ({}, lambda r: np.linalg.norm(error(r)[:2])),
     "lin_vel_z_l2": ({}, lambda r: r["vel"][2] ** 2),
     "ang_vel_xy_l2": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
     "flat_orientation_l2": ({}, lambda r: np.sum(r["projected_gravity"][:2] ** 2)),
