@@ -88,7 +88,7 @@ class Rollout(Uncopied):
         model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
         motors: By default the jumping gains at 18 N m.
         command_filter: Filter of motor targets; None: the targets are not filtered.
-        description: Robot description of the model, by default the project's.
+        description: Robot description of the model, by default the project's; worlds take several in turn.
         double: Whether to compute in double precision.
         dt: Physics step [s].
         substeps: Physics steps in a policy step.
@@ -109,7 +109,7 @@ class Rollout(Uncopied):
         motors: MotorCfg | None = None,
         command_filter: FilterCfg | None = None,
         *,
-        description: RobotDescription | None = None,
+        description: RobotDescription | Sequence[RobotDescription] | None = None,
         double: bool = False,
         dt: float = PHYSICS_DT,
         substeps: int = SUBSTEPS,
@@ -193,29 +193,36 @@ class Rollout(Uncopied):
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
 
     def geometry(self) -> np.ndarray:
-        """Return the lengths [m] that define the geometry of the four legs, which all worlds share.
+        """Return the lengths [m] that define the geometry of the four legs.
 
-        Shape (4 legs, 10 `GEOMETRY_NAMES`), of which `shank` is the inner one. A change of it is one of both shanks.
+        Shape (4 legs, 10 `GEOMETRY_NAMES`) if all worlds share them, otherwise (4, 10, num_worlds). `shank` is the
+        inner one; a change of it is one of both shanks.
         """
         legs = self.dynamics.robot.geometry.numpy()
-        return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
+        rows = np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
+        return rows if len(rows) == 4 else np.resize(rows, (self.num_worlds, 4, rows.shape[1])).transpose(1, 2, 0)
 
     @locked
     def set_geometry(self, lengths: np.ndarray) -> None:
-        """Set the lengths [m] that define the geometry of the four legs in all worlds.
+        """Set the lengths [m] that define the geometry of the four legs in all worlds, or in each.
 
-        lengths: (4, 10), see `geometry`. Raises InputError: another shape, or not finite.
+        lengths: (4, 10) or (4, 10, num_worlds), see `geometry`. Raises InputError: another shape, or not finite.
         """
         lengths = real_array(lengths, "geometry", np.float64)
-        legs = self.dynamics.robot.geometry.numpy().copy()
-        if np.shape(lengths) != (len(legs), len(GEOMETRY_NAMES)):
-            raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
+        shape = (4, len(GEOMETRY_NAMES))
+        if lengths.shape not in (shape, (*shape, self.num_worlds)):
+            raise InputError(f"geometry must have shape {shape} or {(*shape, self.num_worlds)}, got {lengths.shape}")
         if not np.isfinite(lengths).all():
             raise InputError("geometry must be finite")
-        legs["outer_shank"] += lengths[:, GEOMETRY_NAMES.index("shank")] - legs["shank"]
-        legs["hip"] = lengths[:, :3]
-        for name, column in zip(GEOMETRY_NAMES[3:], lengths.T[3:], strict=True):
+        geometry = self.dynamics.robot.geometry
+        legs = np.resize(geometry.numpy(), max(len(geometry), 4 * lengths[0, 0].size))
+        rows = np.resize(np.moveaxis(lengths, -1, 0) if lengths.ndim == 3 else lengths, (len(legs), shape[1]))
+        legs["outer_shank"] += rows[:, GEOMETRY_NAMES.index("shank")] - legs["shank"]
+        legs["hip"] = rows[:, :3]
+        for name, column in zip(GEOMETRY_NAMES[3:], rows.T[3:], strict=True):
             legs[name] = column
+        if len(legs) > len(geometry):
+            self.dynamics.robot.geometry = wp.empty(len(legs), dtype=geometry.dtype, device=self.device)
         self.dynamics.robot.geometry.assign(legs)
 
     # ------------------------------------------------------------------ forward and reverse pass

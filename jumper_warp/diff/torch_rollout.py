@@ -54,8 +54,9 @@ def simulate(
 
     It can be differentiated once, in reverse mode, w.r.t. all tensors except `impulse`: the reverse pass raises
     InputError if `create_graph` is set. Arguments and shapes are those of `Rollout.run`, with or without the axis of
-    worlds. parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds;
-    they are written to the rollout and stay there, and have gradients only from the calls that they are passed to.
+    worlds. parameters: entries of `Rollout.parameters`, or the legs' lengths `geometry` [m], (4, 10) for all worlds or
+    (4, 10, num_worlds); they are written to the rollout and stay there, and have gradients only from the calls that
+    they are passed to.
     trusted: do not check the values; otherwise on a GPU only the latency is checked, which waits for the device.
 
     A policy in the loop runs one policy step per call, each from `end()` of the previous one. Raises InputError:
@@ -83,11 +84,13 @@ def simulate(
             f"a rollout has no parameter {unknown!r:.60}; it has {', '.join(rollout.parameters)}, geometry"
         )
     shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "wrench": (len(targets), 6)}
-    shapes |= {"initial_target": (12,)} | {name: array.shape[:-1] for name, array in rollout.parameters.items()}
+    shapes |= {"initial_target": (12,), "geometry": (4, 10)}
+    shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
     real = torch.float64 if rollout.real is wp.float64 else torch.float32
     for name, tensor in given.items():
-        full = (4, 10) if name == "geometry" else (*shapes[name], rollout.num_worlds)
-        if name != "geometry" and tuple(tensor.shape) == tuple(shapes[name]):
+        shared = name == "geometry" and tensor.dim() == 2
+        full = (4, 10) if shared else (*shapes[name], rollout.num_worlds)
+        if not shared and tuple(tensor.shape) == tuple(shapes[name]):
             tensor = tensor.unsqueeze(-1).expand(full)
         if tuple(tensor.shape) != full:
             raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
@@ -161,7 +164,7 @@ class _Simulate(torch.autograd.Function):
             by_inputs = []
             for name in ctx.names:
                 grad = wp.to_torch(gradients[name].contiguous())
-                by_inputs.append(grad.sum(-1) if name == "geometry" else grad)
+                by_inputs.append(grad.sum(-1) if given[name].dim() < grad.dim() else grad)
         return (None, None, None, *by_inputs)
 
 

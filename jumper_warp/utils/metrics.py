@@ -13,6 +13,7 @@ Scalar = float | int | str | bool | None  # Type of a value, or of each item of 
 UNITS = {
     "_per_s": "1/s", "_n_m": "N/m", "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg",
     "_rad": "rad", "_mm": "mm", "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+    "_j": "J",
 }  # fmt: skip
 """Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
 

@@ -106,6 +106,24 @@ def test_torch_gradients_match_central_differences():
         assert tensor.grad[entry].item() == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1.0e-5)
 
 
+def test_each_world_has_lengths_of_its_own():
+    of, (q, qd) = rollout(2), tensors()
+    targets, same = torch.tensor(push_off(10)), torch.tensor(of.geometry())
+    lengths = torch.stack([same, same + 0.01], dim=-1)
+    both = lengths.clone().requires_grad_()
+    joint = simulate(of, targets, q, qd, geometry=both)
+    np.testing.assert_array_equal(of.geometry(), lengths)
+    losses(joint).backward()
+    for world in range(2):
+        alone = lengths[..., world].clone().requires_grad_()
+        single = simulate(of, targets, q, qd, geometry=alone)
+        torch.testing.assert_close(joint.q[..., world], single.q[..., world], rtol=0.0, atol=0.0)
+        loss = 1.0e-3 * single.torque[..., world].square().sum() + 0.01 * single.impulse[:, :, world, Z].sum()
+        loss.backward()
+        torch.testing.assert_close(both.grad[..., world], alone.grad, rtol=0.0, atol=0.0)
+    simulate(of, targets, q, qd, geometry=same)
+
+
 @pytest.mark.parametrize("seconds", [0.0, 0.011])
 def test_torch_gradients_step_by_step_match_the_whole(seconds):
     """Each policy step has its own call, as with a policy in the loop; a later run with other parameters has no effect.
