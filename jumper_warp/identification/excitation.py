@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,50 @@ from jumper_warp.identification.parameters import ParameterSet
 from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.robot.description import leg_dimensions, load_description
+from jumper_warp.robot.description import RobotDescription, leg_dimensions, load_description
+from jumper_warp.robot.folder import LOCKED
+from jumper_warp.robot.measures import filter_for
 from jumper_warp.robot.motors import walking_filter
-from jumper_warp.robot.values import RobotValues
+from jumper_warp.robot.values import TRANSVERSAL, RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 
-MAX_JOINT_SPEED = 25.0  # [rad/s] largest in a safe motion: two thirds of the slowest motor's no-load speed
+MAX_JOINT_SPEED = 0.625  # [1] largest in a safe motion, over the slowest motor's no-load speed
 MAX_TILT = 20.0  # [deg] largest tilt of the base in a safe motion
-MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of a free base's origin above the ground in a safe motion
+MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of the Jumper's free base above the ground in a safe motion
 MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 
-def unsafe_reason(plan: Plan, record: Record, size: float = 1.0) -> str:
+def size_of(robot: RobotDescription) -> float:
+    """Return the length of a robot's thigh relative to the Jumper's [1], to scale heights and torques."""
+    return leg_dimensions(robot, "FL").thigh / leg_dimensions(load_description(), "FL").thigh
+
+
+def plan_for(robot: RobotDescription, kind: Kind, rng: np.random.Generator, seconds: float) -> Plan:
+    """Sample a plan for a robot: the Jumper's targets, moved with the stops; torque limit by weight and size.
+
+    The jump of a smaller robot ends earlier: impacts after its landing would make many local minima. Without lateral
+    axes both sides move alike on the ground, as a roll would drag the paws aside.
+    """
+    jumper = load_description()
+    size = size_of(robot)
+    plan = sample_plan(kind, rng, seconds, 12.0 * size * robot.mass / jumper.mass)
+    share = min(1.0, math.sqrt(size)) if kind == "small jump" else 1.0
+    target = plan.target[: math.ceil(share * len(plan.target))].copy()
+    target[:, TRANSVERSAL] += 0.5 * (robot.transversal_sum[0] - jumper.transversal_sum[0])
+    if plan.base == "free" and robot.motors[0] == LOCKED:
+        target[:, [3, 4, 5, 9, 10, 11]] = target[:, [0, 1, 2, 6, 7, 8]]
+    return replace(plan, target=target)
+
+
+def unsafe_reason(plan: Plan, record: Record, robot: RobotDescription) -> str:
     """Return the reason why a simulated identification motion is unsafe, or an empty string if it is safe.
 
-    plan: its motor targets; record: motion of one world; size [1]: of the robot's thighs, relative to the Jumper's.
-    Limits of motor angles are the walking filter's.
+    plan: its motor targets; record: motion of one world. Limits of motor angles are the walking filter's.
     """
-    limits = walking_filter()
+    limits = filter_for(walking_filter(), robot)
+    size = size_of(robot)
+    driven = [motor for motor in robot.motors if motor != LOCKED]
     angle = record.angle[..., 0] / DEGREES
     rate = np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)
@@ -45,10 +69,10 @@ def unsafe_reason(plan: Plan, record: Record, size: float = 1.0) -> str:
     )
     if not record.valid[0]:
         return "the simulation diverges"
-    for name, values, limit in checks:
+    for name, values, limit in checks[robot.motors[0] == LOCKED :]:
         if values.min() < limit.lower + MARGIN or values.max() > limit.upper - MARGIN:
             return f"the {name} comes within {MARGIN:g} deg of its limits"
-    if rate > MAX_JOINT_SPEED:
+    if rate > MAX_JOINT_SPEED * min(motor.no_load_speed for motor in driven):
         return f"a joint moves at {rate:.1f} rad/s"
     if plan.base == "free":
         x, y, _, _ = np.moveaxis(record.quaternion[..., 0], 1, 0)
@@ -123,22 +147,18 @@ def choose(
     InputError: no candidate of a kind is safe.
     """
     rng = np.random.default_rng(seed)
-    size = len(scorer.parameters)
-    information = np.eye(size)
+    information = np.eye(len(scorer.parameters))
     plans = []
     gains = []
     refused = []
-    robots = (scorer.replay.description, load_description())
-    # [N m] the Jumper's, in proportion to the peak torque
-    torque_limit = 12.0 * operator.truediv(*(robot.motors[1].peak_torque for robot in robots))
-    size = operator.truediv(*(leg_dimensions(robot, "FL").thigh for robot in robots))
+    robot = scorer.replay.description
     with phase("planning motions", len(kinds) * candidates) as advance:
         for kind in kinds:
             best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
             for _ in range(candidates):
-                plan = sample_plan(kind, rng, seconds, torque_limit)
+                plan = plan_for(robot, kind, rng, seconds)
                 record = scorer.record(plan)
-                if reason := unsafe_reason(plan, record, size):
+                if reason := unsafe_reason(plan, record, robot):
                     refused.append(f"{kind}: {reason}")
                 else:
                     after = information + scorer.information(plan, record)

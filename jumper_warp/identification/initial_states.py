@@ -16,6 +16,7 @@ import numpy as np
 
 from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
+from jumper_warp.robot.folder import LOCKED
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.rotations import CONJUGATE, from_rotation_vector, multiply, rotate
 
@@ -50,7 +51,7 @@ class InitialStatePrior:
 
     The state has I = 27 or 36 normalised coordinates. Coordinates are deviations from the measured state, in prior
     standard deviations: 12 motor readings, 12 rates, the base's rotation vector (3), and for a free base its position,
-    velocity and spin (3 each, world frame).
+    velocity and spin (3 each, world frame). A locked lateral axis rests at its described angle, without a sensor.
     """
 
     def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
@@ -66,6 +67,9 @@ class InitialStatePrior:
         if motion.rate is None and motion.angle is not None:
             rate = column_slopes(motion.time[:rows], motion.angle[:rows])
             rate_std = np.full(12, 1.0)
+        self.locked = [i for i, motor in enumerate(description.motors) if motor == LOCKED]
+        angle[self.locked] = description.poses["default"][0]
+        rate[self.locked] = 0.0
         level = np.array([0.0, 0.0, 0.0, 1.0])
         position = np.array([0.0, 0.0, HANGING_HEIGHT])
         quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
@@ -88,7 +92,7 @@ class InitialStatePrior:
             if self.standing:  # contact constrains the base better than its sensors do
                 tilt_std = np.array([0.2 * DEGREES, 0.2 * DEGREES, tilt_std[2]])
                 base_std = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
-                self.resting = motors_at_rest(motion.rate)
+                self.resting = motion.rate is not None and motors_at_rest(np.delete(motion.rate, self.locked, axis=1))
                 self._levelling = levelling_direction(description, angle)
         mean = (position, quaternion, velocity, np.zeros(3), angle, rate)
         self._mean = InitialStates(*(values[None] for values in mean))
@@ -122,12 +126,12 @@ class InitialStatePrior:
         return state
 
 
-def motors_at_rest(rate: np.ndarray | None) -> bool:
-    """Return whether all 12 motors are at rest, by their mean rates over the first `QUIET_ROWS` of rates (n, 12).
+def motors_at_rest(rate: np.ndarray) -> bool:
+    """Return whether all motors are at rest, by their mean rates over the first `QUIET_ROWS` of rates (n, motors).
 
-    At rest: below `QUIET` [rad/s]. False without rates, or if a motor has none in these rows.
+    At rest: below `QUIET` [rad/s]. False if a motor has no rates in these rows.
     """
-    if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
+    if np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
         return False
     return bool((np.abs(np.nanmean(rate[:QUIET_ROWS], axis=0)) < QUIET).all())
 
@@ -176,9 +180,10 @@ class Stance(NamedTuple):
 def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the paws' centres [m], base frame, (N, 4 legs FL, FR, BL, BR, 3), at motor angles (N, 12) [rad].
 
-    In the leg's plane the paw is one shank away from both knees, on their lower side: at half the knees' distance, and
-    by `rise` times their difference, turned by 90 degrees, below its middle. The lateral motor then turns the plane
-    about body x. Where the knees are too far apart for the five-bar to close, the paw is midway between them.
+    In the leg's plane the ankle is one shank away from each knee, on their lower side: off the middle of the knees by
+    `skew` times their difference, and by `rise` times this difference, turned by 90 degrees. The inner shank extends
+    beyond the ankle to the paw. The lateral motor then turns the plane about body x. Where the knees are too far apart
+    for the five-bar to close, the ankle is on the line between them.
     """
     paws = np.zeros((len(angle), 4, 3))
     for k, name in enumerate(LEGS):
@@ -193,9 +198,13 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
         across = outer_x - inner_x
         up = outer_z - inner_z
         distance = np.maximum(np.hypot(across, up), 1.0e-6)
-        rise = np.sqrt(np.maximum(leg.shank**2 - 0.25 * distance**2, 1.0e-9)) / distance
-        x = 0.5 * (outer_x + inner_x) + leg.front * rise * up
-        z = 0.5 * (outer_z + inner_z) - leg.front * rise * across
+        skew = 0.5 * (leg.shank**2 - leg.outer_shank**2) / distance**2
+        rise = np.sqrt(np.maximum(leg.shank**2 - (0.25 + skew + skew**2) * distance**2, 1.0e-9)) / distance
+        ankle_x = 0.5 * (outer_x + inner_x) + skew * across + leg.front * rise * up
+        ankle_z = 0.5 * (outer_z + inner_z) + skew * up - leg.front * rise * across
+        extension = leg.paw_offset / leg.shank
+        x = ankle_x + extension * (ankle_x - inner_x)
+        z = ankle_z + extension * (ankle_z - inner_z)
         y = leg.plane_y + leg.knee_y
         sine = leg.side * np.sin(lateral)
         cosine = np.cos(lateral)
@@ -248,9 +257,12 @@ def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
 def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
     """Return the smallest motor motion, (12,) [rad/m], that moves a paw from the plane of the others (`unevenness`).
 
-    It is the gradient over its squared norm, along which the correction `levelled` is least. angle: (12,) [rad]."""
+    It is the gradient over its squared norm, along which the correction `levelled` is least. Locked axes do not move.
+    angle: (12,) [rad].
+    """
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
+    slope[[motor == LOCKED for motor in description.motors]] = 0.0
     return slope / (slope @ slope)
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.folder import LOCKED
 from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, TRANSVERSAL, RobotValues
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
@@ -141,11 +142,12 @@ class ParameterSet:
 
 
 def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
-    """Return the unknown parameters of the robot in some groups, by default all 79.
+    """Return the unknown parameters of the robot in some groups, by default all: 79 of the Jumper.
 
-    motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind of motor. masses: mass, com and
-    inertia of the base, mass ratio by kind of link. friction: friction of each motor, the knees and the paws. latency:
-    latency of the targets. offsets: offsets of the 12 angle sensors. Raises InputError: an unknown group or none.
+    motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind and type of motor. masses: mass,
+    com and inertia of the base, mass ratio by kind of link. friction: friction of each motor, the knees and the paws.
+    latency: latency of the targets. offsets: offsets of the angle sensors. A locked lateral axis has no motor: these
+    parameters have no effect on it, and are left out. Raises InputError: an unknown group or none.
     """
     unknown = [group for group in groups if group not in GROUPS]
     if unknown or not groups:
@@ -158,10 +160,15 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
         *(
             Parameter(f"offset/{joint}", "offset", (i,), "rad", 0.0, math.radians(2.0),
                       (-math.radians(10.0), math.radians(10.0)), "absolute", "offsets")
-            for i, joint in enumerate(MOTOR_JOINTS)
+            for i, joint in driven_joints(robot)
         ),
     )  # fmt: skip
     return ParameterSet(tuple(parameter for parameter in every if parameter.group in groups))
+
+
+def driven_joints(robot: RobotDescription) -> list[tuple[int, str]]:
+    """Return index and name of the motor joints that have a motor: all but locked lateral axes."""
+    return [(i, joint) for i, joint in enumerate(MOTOR_JOINTS) if robot.motors[i] != LOCKED]
 
 
 def ratio(
@@ -190,26 +197,30 @@ def relative(
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of motors: kp, kd, armature of each; torque limit, cutoff, no-load speed of each kind."""
+    """Return the parameters of motors: kp, kd, armature of each; torque limit, cutoff, no-load speed of each type."""
     parameters = []
     nominal = RobotValues.nominal(1, robot)
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         values = getattr(nominal, quantity)[0]
         parameters += [
             relative(f"{quantity}/{j}", quantity, (i,), "1", float(values[i]), prior, "motors")
-            for i, j in enumerate(MOTOR_JOINTS)
+            for i, j in driven_joints(robot)
         ]
-    for i, joint in enumerate(MOTOR_JOINTS):
+    for i, joint in driven_joints(robot):
         parameters.append(
             relative(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors")
         )
-    for kind, places in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
-        motor = robot.motors[places[0]]
-        parameters += [
-            relative(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
-            relative(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
-            relative(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
-        ]
+    for kind, members in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
+        types = dict.fromkeys(robot.motors[i] for i in members if robot.motors[i] != LOCKED)
+        for motor in types:  # front and back legs may have different ones
+            name = kind if len(types) == 1 else f"{kind} {motor.type}"
+            places = [i for i in members if robot.motors[i] == motor]
+            limit = float(nominal.saturation[0, places[0]])
+            parameters += [
+                relative(f"saturation/{name}", "saturation", places, "1", limit, 0.1, "motors"),
+                relative(f"cutoff_speed/{name}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
+                relative(f"no_load_speed/{name}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
+            ]
     return tuple(parameters)
 
 
@@ -230,7 +241,7 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the friction parameters: Coulomb friction of 12 motors, knee damping, friction of the paws.
+    """Return the friction parameters: Coulomb friction of each motor, knee damping, friction of the paws.
 
     They are positive and known by their order of magnitude only: their priors are log-normal, with estimated widths.
     """
@@ -238,7 +249,7 @@ def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
         )
-        for i, joint in enumerate(MOTOR_JOINTS)
+        for i, joint in driven_joints(robot)
     ]
     parameters.append(ratio("knee_damping", "knee_damping", (0,), "N m s/rad", robot.knee_damping, 0.4, "friction"))
     parameters.append(ratio("paw_friction", "paw_friction", (0,), "1", PAW_FRICTION, 0.2, "friction"))

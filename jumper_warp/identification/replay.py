@@ -17,8 +17,9 @@ from jumper_warp.diff.rollout import Rollout
 from jumper_warp.identification.initial_states import InitialStates
 from jumper_warp.kernels import layout
 from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.measures import motors_for
 from jumper_warp.robot.model import build_model
-from jumper_warp.robot.motors import MotorCfg
+from jumper_warp.robot.motors import MotorCfg, jumping_motors
 from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.sim.dynamics import WorldRange
 from jumper_warp.utils.rotations import rotate
@@ -98,9 +99,10 @@ class MotionReplay:
         """Return the cached simulation of `count` worlds, and the described robot's parameter table, (321, 1)."""
         if (count, dt) not in self._rollouts:
             model = build_model(count, description=self.description, visuals=False, device=self._device)
+            motors = motors_for(jumping_motors(), self.description)  # `run` replaces all but the over-speed protection
             rollout = Rollout(
                 model, description=self.description, double=True, dt=dt, substeps=1, tolerance=TOLERANCE,
-                threads=self._threads,
+                motors=motors, threads=self._threads,
             )  # fmt: skip
             parts = max(1, min(self._threads, count // 4))  # slices smaller than a simulation's pay off here
             edges = [round(count * i / parts) for i in range(parts + 1)]
@@ -126,13 +128,11 @@ def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: i
 def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: RobotValues) -> None:
     """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each.
 
-    Gains and torque limits of `robots` are factors on those of `motors`; speeds and offsets are values. Peak torques
-    are the same for all robots.
+    Gains, torque limits and peak torques of `robots` are factors on those of `motors`; speeds and offsets are values.
     """
     kinds = [motors.lateral, motors.transversal, motors.transversal] * 4
-    ratios = {"kp": robots.kp, "kd": robots.kd, "saturation": robots.saturation, "peak": np.ones_like(robots.kp)}
-    for name, ratio in ratios.items():
-        parameters[name].assign(np.array([getattr(kind, name) for kind in kinds])[:, None] * ratio.T)
+    for name in ("kp", "kd", "saturation", "peak"):
+        parameters[name].assign(np.array([getattr(kind, name) for kind in kinds])[:, None] * getattr(robots, name).T)
     for name in ("no_load_speed", "cutoff_speed", "offset"):
         parameters[name].assign(np.ascontiguousarray(getattr(robots, name).T))
 

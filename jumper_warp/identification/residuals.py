@@ -235,12 +235,13 @@ class MotionResiduals:
 
         Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
         unknown of the four legs shares a world, which saves three of four simulations. Unknowns without effect, and
-        those that contact determines, get no world; their columns of the Jacobian are 0.
+        those that contact or a locked axis determines, get no world; their columns of the Jacobian are 0.
         """
         size = len(self.parameters)
         single = []
         shared = {}
-        fixed = FIXED_AT_REST if self.initial.resting else ()
+        locked = self.initial.locked
+        fixed = {*(FIXED_AT_REST if self.initial.resting else ()), *locked, *(12 + i for i in locked)}
         for i, parameter in enumerate(self.parameters):
             if self.free:
                 single.append([(i, None)])

@@ -100,18 +100,19 @@ class RobotOverlay:
         check_types("robot overlay", self)
         check_names("quantity", self.values, (*RANGES, *LENGTHS))
         check_names("range of randomisation", self.randomization, RANDOMIZED)
-        nominal = vars(RobotValues.nominal(1))
         for name in LENGTHS:
             values = real_array(self.values.get(name, (0.1,)), f"robot overlay: {name}", float)
             if values.shape not in ((1,), (2,)) or not ((values >= 0.01) & (values <= 1.0)).all():
                 raise InputError(f"robot overlay: {name} must be one or two lengths in 0.01 to 1 m, got {values}")
+        nominal = vars(RobotValues.nominal(1, self.description))
         for name, values in self.values.items():
             if name in LENGTHS:
                 continue
             shape = real_array(values, f"robot overlay: {name}").shape
             if shape != nominal[name].shape[1:]:
                 raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got shape {shape}")
-            check_range(name, values, RANGES[name])
+            # as described: a locked axis has a large armature
+            check_range(name, [x for x, own in zip(values, nominal[name][0], strict=True) if x != own], RANGES[name])
         for name, pair in self.randomization.items():
             if real_array(pair, f"robot overlay: randomization {name}").shape != (2,) or not pair[0] <= pair[1]:
                 raise InputError(f"robot overlay: randomization {name!r:.60} must be [lower, upper], got {pair}")
@@ -188,7 +189,7 @@ def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
             raise InputError(f"robot overlay: unknown {noun} {name!r:.60}; expected one of {', '.join(known)}")
 
 
-def check_range(name: str, values: tuple[float, ...], allowed: Range) -> None:
+def check_range(name: str, values: Sequence[float], allowed: Range) -> None:
     """Raise InputError for a value outside the range `allowed`; name: of the quantity, for the message."""
     low, high, unit = allowed
     hint = " (1: as described)" if allowed is RATIO else ""

@@ -7,21 +7,25 @@ import numpy as np
 import pytest
 
 from columns import Z
-from jumper_warp.identification.excitation import Scorer
+from jumper_warp.identification.excitation import Scorer, choose
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
-from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
+from jumper_warp.identification.recording import KINDS, Plan, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.identification.report import identified_overlay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import weak_directions
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import standing_configuration
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.values import TRANSVERSAL, RobotValues
 from jumper_warp.utils.errors import InputError
 from recorded_motions import simulate_plan
 
 DEGREE = math.pi / 180.0  # [rad]
+OTHER_ROBOTS = ("heavy", "small_direct_drive")  # with weaker motors at the back; without lateral axes
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +69,25 @@ def test_torque_is_linear_in_a_latency_below_a_physics_step(replay):
     assert punctual - half == pytest.approx(0.5 * (punctual - late), rel=1e-6)
 
 
-def test_stance_has_the_models_height():
+@pytest.mark.parametrize(("name", "damping"), [("heavy", 0.3), ("small_direct_drive", 1.0)])
+def test_replay_of_another_robot_matches_its_simulation(name, damping):
+    """Steps of the targets drive the motors to their own peak torques at high speeds; damping: ratio of kd [1]."""
+    robot = load_overlay(name).description
+    target = np.zeros((30, 12))
+    target[:, TRANSVERSAL] = np.where(np.arange(30) // 6 % 2, 2.0, 0.4)[:, None]  # [rad]
+    plan = Plan("hung chirp", target, 100.0)
+    robots = RobotValues.nominal(1, robot)
+    robots.kd *= damping
+    replayed = replay_plan(MotionReplay(description=robot, threads=2), plan, robots)
+    simulated = simulate_plan(plan, robots, robot)
+    assert np.abs(replayed.rate).max() > 35.0  # [rad/s] where the Jumper's over-speed protection begins
+    np.testing.assert_allclose(replayed.angle, simulated.angle, atol=0.05 * DEGREE)
+
+
+@pytest.mark.parametrize("name", ["", *OTHER_ROBOTS])
+def test_stance_has_the_models_height(name):
     """On all paws in the nominal pose the base is as high above the ground as in the simulation's start state."""
-    robot = load_description()
+    robot = load_overlay(name).description if name else load_description()
     height = stance(robot, robot.pose("nominal")[None], np.zeros((1, 12))).height[0]
     assert height == pytest.approx(standing_configuration(robot, "nominal")[Z], abs=1e-9)  # [m]
 
@@ -212,3 +232,33 @@ def test_identify_refuses_a_robot_that_does_not_move(replay):
     motion = measure(plan, "still", replay_plan(replay, plan, robots), robots, rng)
     with pytest.raises(InputError, match="identify none of 1 parameters: latency: the targets hardly change"):
         identify([motion], parameters, replay=replay)
+
+
+@pytest.mark.parametrize(("name", "count"), [("heavy", 82), ("small_direct_drive", 56)])
+def test_parameters_of_another_robot_at_their_prior_means_give_the_described_robot(name, count):
+    """Motors at the back have a torque limit and speeds of their own; a locked axis has no parameters."""
+    robot = load_overlay(name).description
+    parameters = jumper_parameters(description=robot)
+    assert len(parameters) == count
+    robots = vars(parameters.robots(np.zeros((1, count)), robot))
+    for quantity, described in vars(RobotValues.nominal(1, robot)).items():
+        np.testing.assert_allclose(robots[quantity], described, rtol=1e-12, err_msg=quantity)
+
+
+@pytest.mark.parametrize("name", OTHER_ROBOTS)
+def test_another_robot_is_identified_by_safe_motions(name):
+    robot, rng = load_overlay(name).description, np.random.default_rng(3)
+    wanted = ("kp", "saturation", "base_mass", "latency", "knee_damping")
+    every = jumper_parameters(description=robot)
+    parameters = ParameterSet(tuple(p for p in every if p.quantity in wanted and "lateral" not in p.name))
+    truth = sample_z(parameters, seed=2)
+    robots = parameters.robots(truth, robot)
+    replay = MotionReplay(description=robot, threads=2)
+    plans = choose(Scorer(parameters, replay=replay), ("hung chirp", "small jump"), seconds=1.0).plans
+    motions = [measure(plan, f"m{i}", replay_plan(replay, plan, robots), robots, rng) for i, plan in enumerate(plans)]
+    mass = weighed_mass(float(total_mass(robots, robot)[0]), description=robot)
+    result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
+    assert 0.93 < result.chi2 < 1.05
+    error = np.abs(result.z - truth) / result.std
+    assert result.identified.all() and error.max() < 4.0
+    assert RobotOverlay.from_json(identified_overlay(result).to_json()).description.mass == pytest.approx(robot.mass)

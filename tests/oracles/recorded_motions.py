@@ -1,6 +1,7 @@
 """Planned motions of identification, simulated step by step by `Simulation` in single precision."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -9,19 +10,23 @@ from jumper_warp.identification.initial_states import HANGING_HEIGHT, stance
 from jumper_warp.identification.recording import REST, SAMPLES, TICK
 from jumper_warp.identification.replay import Record
 from jumper_warp.robot.description import load_description
-from jumper_warp.robot.motors import MotorCfg
+from jumper_warp.robot.measures import motors_for
+from jumper_warp.robot.motors import MotorCfg, jumping_motors
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, motor_values
 
 HELD_MASS = 1.0e4  # [kg] mass of a held base, whose pose is also reset after each step
 
 
-def simulate_plan(plan, robots):
-    """Return the motion at 240 Hz of one robot (`RobotValues`, N = 1) under planned motor targets from rest."""
+def simulate_plan(plan, robots, description=None):
+    """Return the motion at 240 Hz of one robot (`RobotValues`, N = 1) under planned motor targets from rest.
+
+    description: by default the Jumper's.
+    """
     dt, stride = 1.0 / 480.0, 2  # [s] physics step, and physics steps a row
     period = TICK / SAMPLES
     held = plan.base == "fixed"
-    sim = _make_simulation(plan, robots, dt, held)
+    sim = _make_simulation(plan, robots, description or load_description(), dt, held)
     rows = plan.rows
     rest = round(REST / period)
     target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
@@ -49,7 +54,7 @@ def simulate_plan(plan, robots):
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 
-def _make_simulation(plan, robots, dt, held):
+def _make_simulation(plan, robots, description, dt, held):
     """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base.
 
     A force cancels its weight.
@@ -58,9 +63,11 @@ def _make_simulation(plan, robots, dt, held):
     if held:
         values.base_mass[:] = HELD_MASS
         values.base_com[:] = 0.0
-    description = load_description()
     motors = MotorCfg.from_description(description, "jumping", plan.torque_limit, plan.torque_limit)
-    sim = Simulation(1, motors=motors, dt=dt, visuals=False, robot=values, device="cpu", threads=1)
+    protection = motors_for(jumping_motors(), description)
+    motors = replace(motors, fade_start=protection.fade_start, fade_end=protection.fade_end)
+    settings = {"dt": dt, "visuals": False, "device": "cpu", "threads": 1}
+    sim = Simulation(1, motors=motors, robot=values, description=description, **settings)
     angle = plan.target[0] - values.offset[0]
     q = sim.joint_q()[0].copy()
     q[7 + motor_values(np.arange(20))] = angle
