@@ -110,12 +110,6 @@ def test_watch_fails_with_the_process_of_its_viewer(tmp_path, monkeypatch):
         watch_checkpoints(folder, "cpu", viewer="viser")
 
 
-@pytest.mark.parametrize("content", [b"http://127.0.0.1:1\n", b"\xff"])
-def test_a_damaged_address_of_a_live_view_is_none(tmp_path, content):
-    (tmp_path / "watch.txt").write_bytes(content)
-    assert live_address(tmp_path) is None
-
-
 def test_tail_reads_complete_lines_once(tmp_path):
     tail = MetricsTail(tmp_path)
     assert tail.lines() == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_robot import RATE, STANDING, box_recording, pinhole, walk
-from jumper_warp.viz.scene import ARROW_SECONDS, DEAD_ZONE, MARGIN, body_paths, fit, follow, velocity_arrows
+from jumper_warp.viz.scene import ARROW_SECONDS, DEAD_ZONE, MARGIN, fit, follow, velocity_arrows
 from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR
 
 SIZE = (200, 120)  # [px]
@@ -30,13 +30,6 @@ def test_fitted_view_shows_all_points_and_no_nearer_view_does(direction, extent)
     assert out_of_view(points, view, view.eye + 0.03 * ahead) > 1.0
 
 
-def test_camera_rests_while_the_robot_moves_within_the_dead_zone():
-    angle = np.linspace(0.0, 12.0, 120)
-    circle = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.3 + 0.15 * np.sin(2.0 * angle)], axis=1)
-    circle[0] = [0.0, 0.0, 0.3]
-    assert follow(circle[:, None], 1.0 / RATE) == pytest.approx(np.tile([0.0, 0.0, 0.3], (120, 1)))
-
-
 def test_camera_follows_the_mean_of_walking_robots_at_their_speed_within_the_dead_zone():
     paths = np.stack([walk(4.0, 4.0), walk(4.0, 4.0) + [0.0, 1.5, 0.0]], axis=1)  # 1 m/s
     target = follow(paths, 1.0 / RATE)
@@ -44,12 +37,6 @@ def test_camera_follows_the_mean_of_walking_robots_at_their_speed_within_the_dea
     middle = slice(90, 150)
     assert np.diff(target[middle, 0]) == pytest.approx(1.0 / RATE, rel=1e-6)
     assert (paths[middle, 0, 0] - target[middle, 0]) == pytest.approx(DEAD_ZONE[0], abs=1e-6)
-
-
-def test_paths_of_later_worlds_are_drawn_apart():
-    places = np.zeros((3, 3, 3)) + np.arange(3)[:, None, None] * [0.1, 0.0, 0.0]
-    drawn = body_paths(box_recording(places, spacing=1.5), [0, 2])
-    assert drawn[2] == pytest.approx(np.array([[0.2, 0.0, 0.0], [0.2, 3.0, 0.0]]))
 
 
 def test_arrows_show_commanded_velocity_of_a_turned_robot_and_its_actual_velocity():

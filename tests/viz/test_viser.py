@@ -10,7 +10,7 @@ import viser
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.viz.shapes import shape_meshes
-from jumper_warp.viz.viser import GROUND_PERIOD, ViserScene, glb_of
+from jumper_warp.viz.viser import ViserScene, glb_of
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +35,6 @@ def test_each_link_has_one_node_with_its_pose(server, shapes):
     assert len(scene.links) == 21
     np.testing.assert_array_equal(scene.links[3].batched_positions, poses[:, 3, :3])
     np.testing.assert_array_equal(scene.links[3].batched_wxyzs[:, 0], poses[:, 3, 6])
-
-
-def test_viewer_origin_and_checkerboard_follow_a_point(server, shapes):
-    scene = ViserScene(server.scene, shapes)
-    scene.follow(np.array([30.3, 0.1, 0.0]))
-    np.testing.assert_allclose(scene.root.position, [-30.3, -0.1, 0.0])
-    np.testing.assert_allclose(scene.ground.position, [30.0, 0.0, 0.0])
-    assert scene.ground.position[0] % GROUND_PERIOD == 0.0
 
 
 def test_links_are_relative_to_the_followed_point(server, shapes):
