@@ -85,3 +85,15 @@ def test_environment_randomises_around_overlay_and_saves_it():
     offset = np.degrees(env.sim.motors.offset.numpy() - np.array(VALUES["offset"])[:, None])
     assert np.abs(offset).max() <= 0.2 + 1e-5 and np.ptp(offset) > 0.2
     assert set(env.parameters.latency.numpy()) <= {1, 2}  # 3 to 5 ms
+
+
+def test_overlay_accepts_the_described_armature_of_a_locked_axis():
+    """An armature that differs from the description stays limited."""
+    robot = load_overlay("small_direct_drive")
+    armature = robot.robots().armature[0]
+    assert armature[0] > 1.0  # [kg m^2] above the range
+    np.testing.assert_array_equal(
+        RobotOverlay({"armature": tuple(armature)}, robot=robot.robot).robots().armature[0], armature
+    )
+    with pytest.raises(InputError, match="armature must be in"):
+        RobotOverlay({"armature": tuple(2.0 * armature)}, robot=robot.robot)
