@@ -117,29 +117,6 @@ def test_learning_curves_are_interpolated_by_steps_and_time(runs):
         np.testing.assert_allclose(values[0], [0.1, 0.305, 0.51])
 
 
-def test_the_page_has_settings_seeds_and_a_note_on_few_seeds(runs, tmp_path):
-    comparison = compared(runs, "base", "tuck")
-    page = markdown(comparison)
-    assert "| env.rewards.jump-height.weight |" in page
-    assert "0.51, 0.52, 0.53, 0.54, 0.55" in page
-    assert "Fewer than 5 seeds" not in page
-    few = compare(*(f"{name}={runs}/*_000001*_{name}" for name in ("base", "tuck")), evaluate=False)
-    assert "**Fewer than 5 seeds**" in markdown(few)
-    path = write_report(few, tmp_path, html=True)
-    assert path.name == "comparison.html"
-    assert {PICTURE, PAGE, DATA} <= {each.name for each in path.parent.iterdir()}
-    assert json.loads((path.parent / DATA).read_text())["rows"][1]["arm"] == "tuck"
-    assert "data:image/png" in path.read_text()
-
-
-def test_the_page_names_trainings_of_different_lengths(runs):
-    save_run(runs.parent, "short", 1, [0.3])
-    comparison = compared(runs, "base", "short")
-    assert "**Trainings of different lengths**, iterations: base 20, short 10." in markdown(comparison)
-    assert comparison.primary[0].mean == pytest.approx(0.1)  # of iteration 10
-    assert "different lengths" not in markdown(compared(runs, "base", "tuck"))
-
-
 def test_the_page_shows_the_changes_of_the_users_files(runs):
     for name, weight in (("base", 1), ("tuck", 2)):
         for folder in runs.glob(f"*_{name}"):
@@ -196,12 +173,6 @@ def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
     with pytest.raises(InputError, match=r"vertical_jump has no metric sucess_rate; there are .*success_rate"):
         compare("vertical_jump", "mars_vertical_jump", primary="-sucess_rate", evaluation={"num_jumps": 4})
     assert len(evaluated) == 1
-
-
-@pytest.mark.parametrize("name", ["a$b", r"$\frac$"])
-def test_names_and_titles_are_not_mathematics(runs, tmp_path, name):
-    comparison = compare(f"{name}={runs}/base", f"{name}b={runs}/tuck", evaluate=False, title=f"of {name}")
-    assert write_report(comparison, tmp_path).exists()
 
 
 def test_a_seed_without_the_metric_of_the_best_checkpoint_has_no_steps_to_a_share(runs, tmp_path):

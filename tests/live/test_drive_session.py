@@ -134,7 +134,7 @@ def test_fallen_robot_is_reset(session):
     assert abs(session.position[1]) < 0.1
 
 
-def test_policy_that_only_jumps_is_commanded(tmp_path):
+def test_policy_that_only_jumps_is_commanded():
     session = session_of(SkillNames().jump_to)
     assert list(session.kinds()) == ["jump there"]
     session.jump_to(np.array([0.8, 0.0]))
@@ -143,11 +143,3 @@ def test_policy_that_only_jumps_is_commanded(tmp_path):
     session.jump_to(np.array([1.6, 0.0]))
     advance(session, 3.0)
     assert np.linalg.norm(session.position[:2] - [1.6, 0.0]) < 0.08
-
-
-def test_task_without_sliders_takes_the_values_of_its_labels():
-    session = session_of("attitude", agent="random")
-    assert session.kinds() == {}
-    session.env.command([0.0, 0.0, 0.0, 1.0])
-    advance(session, 0.2)
-    assert np.isfinite(session.poses).all()

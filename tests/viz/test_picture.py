@@ -6,7 +6,7 @@ import pytest
 from box_robot import GREEN, RATE, STANDING, box_recording, pinhole, walk
 from columns import XY, X, Z
 from jumper_warp.viz import picture
-from jumper_warp.viz.picture import GAP, MOST, SIDE_BY_SIDE, SPREAD, compose, write_picture
+from jumper_warp.viz.picture import GAP, MOST, SPREAD, compose, write_picture
 
 GRAVITY = 9.81  # [m/s²]
 SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST = 12, 20, 44, 68, 88  # frames of `jump`
@@ -73,29 +73,10 @@ def test_jump_to_a_goal_away_from_its_start_is_to_scale_with_the_goal(distance, 
     assert any(shape.name == "goal_0_0" for shape in picture._shapes(scene)) == (not spread)
 
 
-def test_each_of_two_jumps_in_a_row_has_its_apex():
-    positions, forces = jump(1.0)
-    later = positions + [1.0, 0.0, 0.0]
-    later[:, 0] = 1.0 + (later[:, 0] - 1.0) ** 2  # accelerated, so its apex is not midway
-    twice = np.concatenate([positions, later])
-    scene = compose(box_recording(twice, forces=np.tile(forces, 2)))
-    second = REST + 1
-    assert scene.flights == [(TAKEOFF, TOUCHDOWN), (second + TAKEOFF, second + TOUCHDOWN)]
-    assert {APEX, second + APEX} <= set(scene.frames)
-
-
 def test_lifted_paws_without_rise_are_no_jump():
     forces = np.full(61, 100.0)
     forces[10:20] = 0.0  # a trot with a flight phase
     assert compose(box_recording(walk(2.0, 1.0), forces=forces)).flights == []
-
-
-@pytest.mark.parametrize(("distance", "moments"), [(0.7, 2), (2.5, 4), (4.0, 6), (9.0, MOST)])
-def test_moments_of_a_walk_are_side_by_side(distance, moments):
-    scene = compose(box_recording(walk(distance, 5.0)))
-    gaps = np.diff(scene.bases[:, X])
-    assert len(scene.frames) == moments and not scene.shift.any()
-    assert gaps.min() >= min(SIDE_BY_SIDE, 0.95 * distance) - 0.05 and gaps.max() < 1.1 * gaps.min()
 
 
 def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_path, monkeypatch):
