@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
     flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
     flags.add_argument("--seconds", type=float, default=float("inf"), help="[s] end after this time")
-    flags.add_argument("--demo", action="store_true", help="stand up, walk and jump without an operator (bus-sim only)")
+    flags.add_argument("--demo", action="store_true", help="stand up, then walk and jump in turn without an operator (bus-sim only)")
     flags.add_argument("--height", type=float, default=0.7, help="[m] height of the base in jumps up (key j)")
     flags.add_argument("--place", type=float, nargs=2, default=(0.5, 0.0), help="[m] ahead and left (key g)")
     flags.add_argument("--log", type=Path, help="folder for the log")
@@ -74,8 +74,9 @@ def main(args: Sequence[str] | None = None) -> None:
 DEMO = (
     (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
+    (15.5, Request.JUMP_TO, (0.8, 0.2, 0.0)), (20.5, Request.WALK, (0.4, 0.0, 0.0)),
 )  # fmt: skip
-"""Requests that let the robot stand up, walk and jump: time [s], request, values."""
+"""Requests that let the robot stand up, walk and jump: time [s], request, values. From the first walk on they repeat."""
 
 
 def run(bundle: Bundle, options: argparse.Namespace) -> None:
@@ -96,13 +97,16 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
     operator = Keyboard(options.height, options.place)
-    script = {round(at * rate): (request, values) for at, request, values in DEMO}
+    first, last_at = round(DEMO[2][0] * rate), round(DEMO[-1][0] * rate)
+    demo = {round(at * rate): (request, values) for at, request, values in DEMO}
     ticks, last, replies = itertools.count(), (State.PASSIVE, 0), 0
 
     def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""
         nonlocal last, replies
-        record = runtime.tick(*(script.get(next(ticks), NOTHING) if options.demo else operator.poll()), late=late)
+        count = next(ticks)
+        count = count if count <= last_at else first + (count - first) % (last_at - first)
+        record = runtime.tick(*(demo.get(count, NOTHING) if options.demo else operator.poll()), late=late)
         replies += np.count_nonzero(record["received"]["motor_fresh"])
         if dog is not None:
             dog.beat()
