@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     flags.add_argument("--capture", action="store_true", help="take the state of a motion capture, not the estimator")
     flags.add_argument("--lockstep", action="store_true", help="wait for jumper bus-sim --lockstep at every tick")
     flags.add_argument("--seconds", type=float, default=float("inf"), help="[s] end after this time")
-    flags.add_argument("--demo", action="store_true", help="stand up, then walk and jump in turn without an operator (bus-sim only)")
+    flags.add_argument("--demo", action="store_true", help="stand up, walk and jump without an operator (bus-sim only)")
     flags.add_argument("--height", type=float, default=0.7, help="[m] height of the base in jumps up (key j)")
     flags.add_argument("--place", type=float, nargs=2, default=(0.5, 0.0), help="[m] ahead and left (key g)")
     flags.add_argument("--log", type=Path, help="folder for the log")
@@ -76,7 +76,7 @@ DEMO = (
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
     (15.5, Request.JUMP_TO, (0.8, 0.2, 0.0)), (20.5, Request.WALK, (0.4, 0.0, 0.0)),
 )  # fmt: skip
-"""Requests that let the robot stand up, walk and jump: time [s], request, values. From the first walk on they repeat."""
+"""Requests of the demo: time [s], request, values. They repeat from the first walk on."""
 
 
 def run(bundle: Bundle, options: argparse.Namespace) -> None:
