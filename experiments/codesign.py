@@ -222,6 +222,8 @@ def draw(axis: Any, jumps: Jumps, design: torch.Tensor, path: torch.Tensor, titl
 
 def main(args: Args) -> Json:
     """Optimise the jump of the nominal leg, then leg and jump; draw both, and return the metrics."""
+    if args.cma:
+        importlib.import_module("cma")  # raise now, not after minutes
     torch.set_num_threads(1)
     folder = prepare("codesign", args, args.threads)
     gravity, distance = PLANETS[args.planet]
