@@ -36,7 +36,8 @@ STEPS_UP = (
 def velocity_rough() -> TaskCfg:
     """Return the task of velocity tracking on a terrain map of level ground, slopes and steps (`GROUNDS`)."""
     flat = velocity_flat()
-    settings = replace(flat.reset.settings, terrain=TerrainCfg(kinds=GROUNDS, slope=12.0), tolerance=0.25)
+    terrain = TerrainCfg(kinds=GROUNDS, step=(0.02, 0.08), slope=12.0)
+    settings = replace(flat.reset.settings, terrain=terrain, tolerance=0.25)
     task = replace(
         flat,
         name="velocity-rough",
@@ -49,7 +50,7 @@ def velocity_rough() -> TaskCfg:
     task = task.with_terms(
         "rewards",
         linear_velocity_fine={"weight": 3.0},
-        yaw_rate_fine={"weight": 8.0},
+        yaw_rate_fine={"weight": 6.0},
         lin_vel_z_l2={"weight": -0.5},
         flat_orientation_l2={"weight": -10.0},
         air_time={"weight": 5.0},
