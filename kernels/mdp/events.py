@@ -7,7 +7,7 @@ an event's function and the places of its numbers in `p`, so that a number can c
 import warp as wp
 
 from .durations import whole_steps
-from .env import EpisodeArrays, launched_world
+from .env import EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
@@ -53,10 +53,10 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         num_worlds), policy steps until an interval event is due, 0: not set, as after a handover. An interval event is
         also due at a reset.
         """
-        row, lane, index = wp.tid()
+        row, lane, world = wp.tid()
         row += first
-        world = launched_world(episode, index)
-        if world < 0 or episode.skill[world] != skill or mask[world] == 0.0:
+        world += episode.first
+        if episode.skill[world] != skill or mask[world] == 0.0:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].parallel)) or lane == 0):

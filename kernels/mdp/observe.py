@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import BEGUN, COMMANDED, RING, EpisodeArrays, launched_world
+from .env import BEGUN, COMMANDED, RING, EpisodeArrays
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .parameters import RobotParameters
@@ -128,9 +128,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         One thread per (chunk of terms, world of `skill`). after_reset 1: only where an episode or the skill has just
         begun, or a new command was set. term_value, found, found_states: see `record_non_finite`.
         """
-        chunk, index = wp.tid()
-        world = launched_world(episode, index)
-        if world < 0 or episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
+        chunk, world = wp.tid()
+        world += episode.first
+        if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
         finite = bool(True)
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
@@ -276,9 +276,9 @@ def postprocess_obs_kernel(
     Non-finite values, and all rows and history of diverged worlds, are 0. after_reset 1: only where an episode or
     skill has just begun, or a new command was set; `final` stays, and so do the older frames after a command.
     """
-    index, lane = wp.tid()
-    world = launched_world(episode, index)
-    if world < 0 or episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
+    world, lane = wp.tid()
+    world += episode.first
+    if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
         return
     m = step_context(episode, arrays, world)
     for component in range(lane, columns.shape[1], LANES):

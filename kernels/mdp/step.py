@@ -12,7 +12,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from . import terminations
-from .env import BEGUN, Counters, EpisodeArrays, launched_world
+from .env import BEGUN, Counters, EpisodeArrays
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .unroll import unrolled
@@ -107,8 +107,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         A reward of weight 0 is not evaluated.
         observed: observation terms before this step; found, found_states: see `record_non_finite`.
         """
-        world = launched_world(episode, wp.tid())
-        if world < 0 or episode.skill[world] != skill:
+        world = episode.first + wp.tid()
+        if episode.skill[world] != skill:
             return
         robot = load_view(arrays, ground, world)
         state = wp.static(advance.func)(robot, states[world], *p[wp.static(advance.start) : wp.static(advance.stop)])
