@@ -94,7 +94,7 @@ def body() -> str:
         "parameter | value | unit | source",
         [
             ("total mass", number(robot.mass), "kg", PAPER),
-            ("body, with payload", mass["body"], "kg", "total less the CAD export's legs"),
+            ("body, with payload", mass["body"], "kg", "total minus the legs of the CAD export"),
             ("motor housing with three motors", mass["housing"], "kg", CAD),
             ("thigh", mass["outer_thigh"], "kg", CAD),
             ("outer shank", mass["outer_shank"], "kg", CAD),
@@ -105,7 +105,7 @@ def body() -> str:
             ("outer axis x, from the hip", f"±{number(front.outer_x)}", "m", CAD),
             ("inner axis x, from the hip", f"±{number(front.inner_x)}", "m", CAD),
             ("plane of the thighs, y from the hip", f"±{number(front.plane_y)}", "m", CAD),
-            ("knees and ankle, y from that plane", f"±{number(front.knee_y)}", "m", CAD),
+            ("knees and ankle, y from the plane of the thighs", f"±{number(front.knee_y)}", "m", CAD),
             ("thigh length", number(front.thigh), "m", PAPER),
             ("shank length", number(front.shank), "m", PAPER),
             ("paw radius", number(front.paw_radius), "m", CAD),
