@@ -178,7 +178,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
     nominal = rows["nominal"]
     note = f"Each row is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}.\n"
-    note += f"Trained on {trained_on(task, nominal.values)}.\n"
+    note += f"Commands of the training: {trained_on(task, nominal.values)}.\n"
     reasons = [
         f"Not measured: {title}, since {reason}.\n"
         for name, (title, _) in CONDITIONS.items()
