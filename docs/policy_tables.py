@@ -224,7 +224,11 @@ def measured_table(name: str) -> str:
         "machine": [row["machine"] for row in rows],
         "commit": [f"{row['commit']}, {row['date']}" for row in rows],
     }
-    shared = [values[0] for values in origins.values() if len(set(values)) == 1]
+    shared = [
+        values[0] if title == "machine" else f"commit {values[0]}"
+        for title, values in origins.items()
+        if len(set(values)) == 1
+    ]
     varying = {title: values for title, values in origins.items() if len(set(values)) > 1}
     lines = [[*row["cells"], *(values[i] for values in varying.values())] for i, row in enumerate(rows)]
     text = markdown((*table["columns"], *varying), lines)
