@@ -53,7 +53,7 @@ def still(tmp_path_factory):
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
         (["list", "--task-module", "missing.py"], "missing.py: no such file (tasks of your own)"),
         (["play", "missing"], "no policy 'missing'"),
-        (["evaluate", "velocity_flat"], "a task, not a policy; its policies: walking_flat"),
+        (["evaluate", "velocity_flat"], "a task, not a policy; its policies: walking"),
         (["evaluate", "vertical_jump", "--height-range", "1.0", "0.5"], "height_range must be"),
         (["evaluate", "vertical_jump", "--out", "\udcff"], "'\\udcff' is not UTF-8"),
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),

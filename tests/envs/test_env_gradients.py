@@ -21,7 +21,7 @@ from jumper_warp.utils.errors import InputError
 POLICIES = {
     "vertical-jump": "vertical_jump",
     "horizontal-jump": "horizontal_jump",
-    "velocity-flat": "walking_flat",
+    "velocity-flat": "walking",
     "attitude": "attitude",
 }
 

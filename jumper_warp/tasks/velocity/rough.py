@@ -16,11 +16,13 @@ from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.robot.terrain import KINDS, TerrainCfg
 from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
+from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
-from jumper_warp.tasks.velocity.flat import ACTOR, velocity_flat
+from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
+ACTOR = remembered(WITHOUT_HISTORY, 8)  # Policy observation: over eight policy steps, or 0.13 s
 REACH = (1.1, 1.1, 0.75, 1.1)
 COMMANDS = CommandCfg(REACH, REACH, levels=0, standing_probability=0.15, resampling_time_range=(1.5, 5.0))
 """Velocity commands on the terrain map, at one level."""
@@ -44,7 +46,8 @@ def velocity_rough() -> TaskCfg:
         reset=replace(flat.reset, settings=settings),
         levels=(COMMANDS,),
         observations=ObservationsCfg(
-            actor=ACTOR, critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights))
+            actor=ACTOR,
+            critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights)),
         ),
     )
     task = task.with_terms(
