@@ -33,7 +33,7 @@ EARTH = {"walk": "walking", "jump_up": "vertical_jump", "jump_to": "horizontal_j
 SCENES = {
     "plain": EARTH,
     "blocks": EARTH | {"jump_to": "sighted_jump"},
-    "rough": EARTH | {"walk": "walking"},
+    "rough": EARTH,
     "mars": EARTH | {"jump_up": "mars_vertical_jump", "jump_to": "mars_horizontal_jump"},
 }
 """Name of the policy of each skill by scene of the page."""
