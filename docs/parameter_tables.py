@@ -148,7 +148,7 @@ def passive() -> str:
     return table(
         "parameter | value | unit | source",
         [
-            ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, cut to what the shell allows"),
+            ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, limited by the shell"),
             ("stops, transversal", degrees(outer.lower, outer.upper), "deg", CONFIG),
             ("stops, outer + inner", degrees(*robot.transversal_sum), "deg", CONFIG),
             ("stiffness of the stops", number(LIMIT_STIFFNESS), "N m/rad", "numerical"),

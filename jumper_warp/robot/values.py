@@ -29,7 +29,7 @@ class RobotValues:
     base_mass: np.ndarray  # (N, 1) [kg] Mass of the base link
     base_com: np.ndarray  # (N, 3) [m] Centre of mass of the base link, in its frame
     base_inertia: np.ndarray
-    """(N, 1) [1] Factor on the described inertia about the centre of mass, in addition to the ratio of base masses."""
+    """(N, 1) [1] Factor on the described inertia about the centre of mass, which also scales with `base_mass`."""
     link_mass: np.ndarray  # (N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`
     armature: np.ndarray  # (N, 12) [kg m^2] Rotor inertia at the gear's output
     motor_friction: np.ndarray  # (N, 12) [N m] Coulomb friction at the gear's output
