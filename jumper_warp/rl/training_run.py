@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from jumper_warp.rl.clock import TrainingClock, is_last_iteration
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
-from jumper_warp.rl.logger import NoLog, Scores, SeedConsole, Stopwatch, TrainingConsole, TrainingLog
+from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingConsole, TrainingLog
 from jumper_warp.rl.run_folder import CONFIG, TrainResult, full_config, new_folder, report_non_finite, write_config
 from jumper_warp.rl.run_names import CHECKPOINTS, SEED
 from jumper_warp.rl.stop_request import StopRequest
@@ -37,19 +37,19 @@ class TrainingRun:
     """State of a training in this process: algorithm, environment, folder, iteration, time."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None, *, folder: Path | None = None,
-        console: TrainingConsole | SeedConsole | None = None, stream: AbstractContextManager[None] | None = None,
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, console: TrainingConsole, stream: AbstractContextManager,
+        command: str | None = None, actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None,
+        folder: Path | None = None,
     ) -> None:  # fmt: skip
         """Build the algorithm, and load the checkpoint, else apply `actor_init` if given.
 
-        command, actor_init, checkpoint: as in `train`. folder: of a new run (default: a new one, by
-        time). console: shows lines and progress (default: a new one). stream: context in which all work of the run is
-        enqueued (default: the current stream). Raises InputError or CheckpointError as `train`.
+        console: shows lines and progress. stream: context in which all work of the run is enqueued. command,
+        actor_init, checkpoint: as in `train`. folder: of one of several seeds (default: a new one, by time). Raises
+        InputError or CheckpointError as `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
-        self.stream = nullcontext() if stream is None else stream
+        self.stream, self._console, self._is_single = stream, console, folder is None
         self.ppo = make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in STATISTICS}
         self._logged = {*env.metrics(), *losses, *LEARNING, *PERF}  # Names of the logged metrics
@@ -76,10 +76,8 @@ class TrainingRun:
             folder.mkdir(parents=True)
         else:
             self.folder = new_folder(cfg, rank)
-        if console is None:
+        if self._is_single:
             self.notes.insert(0, f"run {self.folder}")
-            console = TrainingConsole(cfg)
-        self._console = console
         if rank.index == 0:
             write_config(self.folder, self.config)
 
@@ -165,9 +163,15 @@ class TrainingRun:
             self.metrics = self._read_metrics(times)
             self._scores.add(self.metrics)
             log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
+            if self._is_single:
+                self._console.flush()
         elif self.iteration == self._first_iteration:
             watch.read()  # the rate in the log leaves the warm-up out
-        if is_last and not self.failure and not self._console.brief:
+        if is_last and self.failure and not self._is_single:
+            log.print_line(f"frozen at iteration {self.iteration}: {self.failure}")
+            with suppress(OSError):
+                (self.folder / resume.FROZEN).write_text(f"iteration {self.iteration}: {self.failure}\n")
+        elif is_last and not self.failure and self._is_single:
             log.print_line(f"ended by {self.reason(stop)}")
         if (is_last or saves) and self._is_finite:
             self._save(is_last, stop)
@@ -182,7 +186,7 @@ class TrainingRun:
         """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
         if self.rank.index != 0:
             return NoLog()
-        return TrainingLog(self.folder, self.config, self.cfg, self.iteration, self._console)
+        return TrainingLog(self.folder, self.config, self.cfg, self._console, self.iteration)
 
     def _steps(self) -> int:
         """Return the number of environment steps in an iteration, of all worlds."""
@@ -252,7 +256,7 @@ class TrainingRun:
             self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         self._scores.clear()
-        if is_last and not self._console.brief:
+        if is_last and self._is_single:
             hint = f", continue with: {self.resume_command}"
             self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 
