@@ -225,11 +225,13 @@ def robots_of(robot: RobotOverlay | Sequence[RobotOverlay] | None) -> list[Robot
     return [robot] if isinstance(robot, RobotOverlay) else list(robot)
 
 
-def load_overlay(path: Path) -> RobotOverlay:
+def load_overlay(path: Path | None) -> RobotOverlay:
     """Read a robot: its folder or `robot.json`, an overlay, or an overlay whose `robot` is the folder beside it.
 
-    Raises InputError: it cannot be read, or is neither.
+    None: the Jumper. Raises InputError: it cannot be read, or is neither.
     """
+    if path is None:
+        return RobotOverlay({})
     if not Path(path).exists() and (ROBOTS / path / FILE).is_file():
         path = ROBOTS / path
     if Path(path).is_dir():
