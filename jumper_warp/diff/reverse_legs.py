@@ -29,7 +29,7 @@ class LegThreadReverse:
         self._modules = dynamics.modules
         self._device = dynamics.model.device
         self._num = dynamics.model.world_count
-        kind = self._modules.leg_adjoint.LegRecord
+        kind = self._modules.leg_record.LegRecord
         self._record = kind()
         shape = (SPAN * (every + 1), self._num, 4)
         for name, field in kind.vars.items():

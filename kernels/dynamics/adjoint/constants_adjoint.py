@@ -14,7 +14,8 @@ from ..trajectory import Actuation, Commands, Timing, TrajectoryArrays, load_wor
 from .action_gradients import leg_action_gradient
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
-from .leg_adjoint import LegRecord, add_leg_constants, base_factors, leg_factors
+from .leg_adjoint import add_leg_constants, base_factors, leg_factors
+from .leg_record import LegRecord
 from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
 

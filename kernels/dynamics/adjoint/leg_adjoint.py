@@ -17,17 +17,7 @@ from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_f
 from ...layout import GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ...scalar import mat33, real, vec3
 from ...state import BaseState
-from ..base_dynamics import (
-    BaseInverse,
-    BaseSystem,
-    LegSolve,
-    add_leg,
-    invert,
-    motor_acceleration,
-    solve_ang,
-    solve_lin,
-    sum_systems,
-)
+from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
 from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
@@ -38,84 +28,10 @@ from ..trajectory import TrajectoryArrays, row_vec3
 from . import action_gradients
 from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient, make_base_factors
 from .gradients import ThreadSums, add_entry, add_leg_parameters
-from .virtual_power import BaseCotangent, BaseFactors, LegFactors, add, rotation_adjoint_scalar
+from .leg_record import BaseWeights, LawRow, LegLaw, LegRecord, LegWeights
+from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
-
-
-@wp.struct
-class BaseWeights:
-    """Solved adjoint multipliers of the base's equations of motion in a step, body axes."""
-
-    lin: vec3  # virtual velocity, see `virtual_power`
-    ang: vec3  # virtual angular velocity
-    cotangent: BaseCotangent
-
-
-@wp.struct
-class LegWeights:
-    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step.
-
-    The pass backwards in time computes these multipliers. The kernels of `constants_adjoint` read them, for all steps
-    in parallel.
-    """
-
-    rates: vec3  # virtual rates of the motors
-    law: vec3  # multiplier of the contact law, body axes
-
-
-@wp.struct
-class MotorSlopes:
-    """Derivatives of each of a leg's motor torques w.r.t. its own target, angle and rate; lateral, outer, inner."""
-
-    target: vec3  # [N m/rad]
-    angle: vec3  # [N m/rad]
-    rate: vec3  # [N m s/rad]
-
-
-@wp.struct
-class LegLaw:
-    """Contact law of a paw, linearised at the solution of a step, as the reverse pass records it."""
-
-    mode: int  # SEPARATE, STICK or SLIDE
-    mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real  # friction coefficient
-    impulse: vec3  # [N s], body axes
-    point: vec3  # [m] where the paw touches, body axes, from the base's origin
-    jacobian: mat33  # contact velocity per motor rate [m/rad]
-    to_lin: mat33  # change of the base's linear velocity per impulse [1/kg]
-    to_ang: mat33  # change of its angular velocity per impulse [1/(kg m)]
-    by_velocity: mat33  # derivative of the law w.r.t. the contact velocity, see `contact_laws.PawLaw`
-
-
-@wp.struct
-class LawRow:
-    """One paw's row in the inverse of the 12x12 contact-law matrix A^T (`step_adjoint`): a 3x3 block per paw."""
-
-    a: mat33  # FL
-    b: mat33  # FR
-    c: mat33  # BL
-    d: mat33  # BR
-
-
-@wp.struct
-class LegRecord:
-    """Record of successive physics steps for the reverse pass: an entry per step, and one for the final state.
-
-    Arrays of the base are (entries, num_worlds), of legs (entries, num_worlds, 4).
-    """
-
-    base: wp.array2d(dtype=BaseState)  # at the start of the step
-    inverse: wp.array2d(dtype=BaseInverse)  # of the base's equations of motion, a 6x6 matrix
-    base_weights: wp.array2d(dtype=BaseWeights)
-    angles: wp.array3d(dtype=vec3)  # [rad] lateral, outer, inner
-    rates: wp.array3d(dtype=vec3)  # [rad/s]
-    solve: wp.array3d(dtype=LegSolve)  # motor accelerations by the base's acceleration
-    slopes: wp.array3d(dtype=MotorSlopes)
-    law: wp.array3d(dtype=LegLaw)
-    law_row: wp.array3d(dtype=LawRow)  # defined only where a paw of the world touches
-    weights: wp.array3d(dtype=LegWeights)
-    by_filter: wp.array3d(dtype=vec3)  # gradient w.r.t. the angles that the filter reads, where a policy step begins
 
 
 @wp.struct

@@ -33,7 +33,8 @@ from ..trajectory import (
 from . import rollout_adjoint
 from .command_adjoint import add_targets, filter_gradient, motor_gradient
 from .gradients import Gradients, add_com, add_filter, add_moments, add_vec3, thread_sums
-from .leg_adjoint import LegAdjoint, LegRecord, MotorSlopes, replay_leg, reverse_leg
+from .leg_adjoint import LegAdjoint, replay_leg, reverse_leg
+from .leg_record import LegRecord, MotorSlopes
 from .rollout_adjoint import RowCotangent, generate_adjoints
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
