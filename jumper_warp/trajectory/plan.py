@@ -72,13 +72,16 @@ class PlanModel:
 
     def __init__(
         self, robots: Snapshot, goal: np.ndarray, *,
-        double: bool = False, threads: int | None = None,
+        substeps: int = SUBSTEPS, double: bool = False, threads: int | None = None,
     ) -> None:  # fmt: skip
-        """Copy the parameters of the robots of an environment of one task on level ground; others as in `Rollout`."""
+        """Copy the parameters of the robots of an environment of one task on level ground.
+
+        substeps: physics steps in a policy step. double, threads: as in `Rollout`.
+        """
         task = robots.tasks[0]
         self.rollout = Rollout(
             robots.model, task.motors, task.command_filter, double=double, threads=threads,
-            dt=robots.dt * robots.substeps / SUBSTEPS, substeps=SUBSTEPS,
+            dt=robots.dt * robots.substeps / substeps, substeps=substeps,
         )  # fmt: skip
         for name, tensor in robots.parameters.items():
             wp.to_torch(self.rollout.parameters[name]).copy_(tensor)
