@@ -16,11 +16,10 @@ from jumper_warp.envs.env import Env
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.policy import Policy
 from jumper_warp.tasks.jump.evaluation import JumpEvaluation
-from jumper_warp.trajectory.plan import SUBSTEPS, Plan, PlanModel, Start
+from jumper_warp.trajectory.plan import LONGEST, SUBSTEPS, Plan, PlanModel, Start
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import turn_plane
 
-LONGEST = 150  # Policy steps from command to touchdown and rest, at most
 SETTLED = 30  # Policy steps of a plan after the touchdown
 SHORTEST = 20  # Policy steps that a plan looks ahead, at least
 SPARE = 1000  # Policy steps that a plan repeats its last actions
