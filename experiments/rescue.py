@@ -7,8 +7,8 @@ the script counts those that the controller saves: after long optimisations befo
 and with the simulation's own physics step (offline), with two iterations in every policy step and the changed robot as
 the assumed one (known), or a robot that is identified from the lost jump (identified). A robot that any of these saves
 is savable. The script also compares policy and controller on nominal robots, measures the time of a policy step, and
-writes `metrics.json`, the outcome of each robot (`outcomes.json`) and `rescue.png`. Processes (`--processes`) share the
-robots, in batches of similar goals.
+writes `metrics.json`, the outcome of each robot (`outcomes.json`), `rescue.png` and, with `--film`, `rescue.webp`.
+Processes (`--processes`) share the robots, in batches of similar goals.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,15 +29,18 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.log import SUCCESS, run_evaluation
 from jumper_warp.evaluation.predictive_control import SCALES, PredictiveController
-from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.runtime import configure_device
+from jumper_warp.viz.film import write_film
+from jumper_warp.viz.pairs import side_by_side
 from jumper_warp.viz.plots import figure
+from jumper_warp.viz.recording import Recording
 from measure_policies import payload_overlay
 from support.own_motion import Record, RobotChange, identify, recorder_of, write_changes
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
@@ -75,11 +78,21 @@ class Args(ThreadArgs):
     nominal: int = 400  # Number of nominal robots of each policy
     candidates: int = 1500  # Number of jumps from which lost ones are taken
     iterations: int = 2  # Iterations in a policy step
+    substeps: int = 4  # Physics steps of a plan in a policy step, except in the mode offline
     offline_iterations: int = 200  # Iterations before the jump in the mode offline
     timed: int = 3  # Number of jumps of a single robot whose steps are timed
     seed: int = 1  # Seed of the goals; the controller was tuned with seed 0
     processes: int = 1  # Number of processes that share the robots
     batch: int = 8  # Number of robots that a process simulates at once
+    film: bool = False  # Film a saved robot of each change beside the same robot with the policy
+
+
+class Rescue(NamedTuple):
+    """Outcome of a batch of jumps."""
+
+    ends: np.ndarray  # (robots,) names of the outcomes, see `JumpLog.outcomes`
+    found: RobotChange | None = None  # identified changes
+    recording: Recording | None = None  # of the first robot
 
 
 class Robots:
@@ -128,7 +141,8 @@ class Robots:
 
     def controller(self, env: Env, assumed: Env, **options: Any) -> PredictiveController:
         """Return the controller of the robots of `env` with assumed ones; options: of `PredictiveController`."""
-        options = {"iterations": self.args.iterations, "threads": self.args.threads} | options
+        args = self.args
+        options = {"iterations": args.iterations, "substeps": args.substeps, "threads": args.threads} | options
         return PredictiveController(env, self.policy, assumed, **options)
 
     def record(self, goals: np.ndarray) -> Record:
@@ -139,42 +153,37 @@ class Robots:
         return record
 
     def offline(self, goals: np.ndarray) -> np.ndarray:
-        """Return which robots long optimisations before the jump save, (len(goals),)."""
-        saved = np.zeros(len(goals), dtype=bool)
+        """Return the outcomes of jumps after long optimisations before them, (len(goals),)."""
+        ends = np.full(len(goals), "", dtype=object)
         for scales in STARTS:
-            rest = np.flatnonzero(~saved)
+            rest = np.flatnonzero(ends != SUCCESS)
             if len(rest):
                 env = self.env(len(rest))
                 controller = self.controller(
                     env, self.env(len(rest)), scales=scales, iterations=1, substeps=SUBSTEPS
                 )  # fmt: skip
                 controller.first_iterations = self.args.offline_iterations
-                saved[rest] = self.run(env, controller.act, goals[rest]).success[:, 0]
-        return saved
+                ends[rest] = self.run(env, controller.act, goals[rest]).outcomes[:, 0]
+        return ends
 
-    def rescue(self, mode: str, goals: np.ndarray, folder: Path | None) -> tuple[np.ndarray, RobotChange | None]:
-        """Return which robots the controller saves, (len(goals),), and the identified changes, if any.
-
-        folder: of a recording of three robots; None: no recording.
-        """
+    def rescue(self, mode: str, goals: np.ndarray, film: bool = False) -> Rescue:
+        """Return the outcome of jumps to goals [m] with the policy, or with the controller in one of `Args.modes`."""
         if mode == "offline":
-            return self.offline(goals), None
+            return Rescue(self.offline(goals))
         env = self.env(len(goals))
-        assumed = self.env(len(goals), changed=mode != "identified")
+        act = self.policy.act
         found = None
-        if mode == "identified":
-            found = identify(self.record(goals), assumed)
-            write_changes(assumed, found)
-        controller = self.controller(env, assumed)
+        if mode != "policy":
+            assumed = self.env(len(goals), changed=mode != "identified")
+            if mode == "identified":
+                found = identify(self.record(goals), assumed)
+                write_changes(assumed, found)
+            act = self.controller(env, assumed).act
         log = self.log(env, goals)
-        if folder is None:
-            run_evaluation(controller.act, env, log)
-            return log.success[:, 0], found
-        recorder = EnvRecorder(env, log, range(min(3, len(goals))), notes={"task": f"rescued, {mode}"})
-        run_evaluation(controller.act, env, log, on_begin=recorder.begin, on_step=recorder)
-        folder.mkdir(exist_ok=True)
-        save_recording(recorder.recording(), folder, mode)
-        return log.success[:, 0], found
+        recorder = EnvRecorder(env, log, range(1)) if film else None
+        calls = {} if recorder is None else {"on_begin": recorder.begin, "on_step": recorder}
+        run_evaluation(act, env, log, **calls)
+        return Rescue(log.outcomes[:, 0], found, recorder and recorder.recording())
 
 
 @dataclass(frozen=True)
@@ -185,14 +194,6 @@ class Job:
     name: str  # of the change
     mode: str  # `policy`, or one of `Args.modes`
     goals: np.ndarray  # [m]
-    folder: Path | None = None  # of the recording
-
-    def __call__(self) -> tuple[np.ndarray, RobotChange | None]:
-        """Return which jumps succeed, and the identified changes, if any."""
-        robots = Robots((CHANGES | NOMINAL)[self.name], self.args)
-        if self.mode == "policy":
-            return robots.run(robots.env(len(self.goals)), robots.policy.act, self.goals).success[:, 0], None
-        return robots.rescue(self.mode, self.goals, self.folder)
 
 
 def start_process(args: Args) -> None:
@@ -201,9 +202,9 @@ def start_process(args: Args) -> None:
     configure_device(args.device, 1)
 
 
-def run_job(job: Job) -> tuple[np.ndarray, RobotChange | None]:
+def run_job(job: Job) -> Rescue:
     """Run a job in a process of the pool."""
-    return job()
+    return Robots((CHANGES | NOMINAL)[job.name], job.args).rescue(job.mode, job.goals)
 
 
 def run_jobs(args: Args, jobs: list[Job], folder: Path) -> dict[tuple[str, str], tuple[np.ndarray, list[RobotChange]]]:
@@ -216,15 +217,15 @@ def run_jobs(args: Args, jobs: list[Job], folder: Path) -> dict[tuple[str, str],
     pool = None
     if args.processes > 1:
         pool = ProcessPoolExecutor(args.processes, get_context("spawn"), start_process, (args,))
-    for i, (success, found) in enumerate((pool.map if pool else map)(run_job, jobs), 1):
+    for i, (ends, found, _) in enumerate((pool.map if pool else map)(run_job, jobs), 1):
         job = jobs[i - 1]
         key = job.name, job.mode
         successes, changes = results.get(key, (np.zeros(0, dtype=bool), []))
-        results[key] = np.concatenate([successes, success]), changes + ([] if found is None else [found])
+        results[key] = np.concatenate([successes, ends == SUCCESS]), changes + ([] if found is None else [found])
         total = results[key][0]
         rows += [
-            {"change": job.name, "mode": job.mode, "goal_m": goal, "success": made}
-            for goal, made in zip(job.goals.tolist(), success.tolist(), strict=True)
+            {"change": job.name, "mode": job.mode, "goal_m": goal, "outcome": end}
+            for goal, end in zip(job.goals.tolist(), ends.tolist(), strict=True)
         ]
         (folder / "outcomes.json").write_text(json.dumps(rows, indent=0))
         announce(f"{i} of {len(jobs)}: {', '.join(key)}: {total.sum()} of {len(total)}")
@@ -261,7 +262,7 @@ def time_steps(args: Args) -> dict[str, float]:
     return values
 
 
-def make_jobs(args: Args, folder: Path, values: dict[str, float]) -> list[Job]:
+def make_jobs(args: Args, values: dict[str, float]) -> list[Job]:
     """Return the jobs of all robots, and add the shares of lost robots to `values`."""
     jobs = []
     for name, modes in (dict.fromkeys(NOMINAL, ("policy", "known")) | dict.fromkeys(args.changes, args.modes)).items():
@@ -273,11 +274,20 @@ def make_jobs(args: Args, folder: Path, values: dict[str, float]) -> list[Job]:
             values |= {f"{name}_lost_rate": lost / args.candidates, f"{name}_robots": float(len(goals))}
             announce(f"{name}: {lost} of {args.candidates} lost")
         batches = np.array_split(np.sort(goals), -(-len(goals) // args.batch)) if len(goals) else []
-        jobs += [
-            Job(replace(args, threads=1), name, mode, batch, None if i or name in NOMINAL else folder / name)
-            for mode in modes for i, batch in enumerate(batches)
-        ]  # fmt: skip
+        jobs += [Job(replace(args, threads=1), name, mode, batch) for mode in modes for batch in batches]
     return jobs
+
+
+def film_rescues(args: Args, jobs: list[Job], results: dict, path: Path) -> None:
+    """Film a saved robot of each change, with the policy and with the controller that knows the change."""
+    recordings = {}
+    for name in args.changes:
+        goals = [job.goals for job in jobs if (job.name, job.mode) == (name, "known")]
+        saved = np.concatenate(goals)[results[name, "known"][0]] if goals else np.zeros(0)
+        for mode in ("policy", "known") if len(saved) else ():
+            rescue = Robots(CHANGES[name], args).rescue(mode, saved[[len(saved) // 2]], film=True)
+            recordings[f"{name.replace('_', ' ')}, {mode}"] = rescue.recording
+    write_film(side_by_side({label: each for label, each in recordings.items() if each}), path)
 
 
 def main(args: Args) -> dict:
@@ -285,7 +295,8 @@ def main(args: Args) -> dict:
     torch.set_num_threads(1)
     folder = prepare("rescue", args, args.threads)
     values: dict[str, float] = time_steps(args) if args.timed else {}
-    results = run_jobs(args, make_jobs(args, folder, values), folder)
+    jobs = make_jobs(args, values)
+    results = run_jobs(args, jobs, folder)
     for (name, mode), (success, changes) in results.items():
         if name in NOMINAL:
             values[f"{name}_{mode}_success_rate"] = float(success.mean())
@@ -305,6 +316,8 @@ def main(args: Args) -> dict:
         axis.set_xticks(np.arange(len(names)), names)
         axis.set_ylabel("share of lost robots")
         axis.legend()
+    if args.film:
+        film_rescues(args, jobs, results, folder / "rescue.webp")
     keys = [key for key in values if key.endswith(("saved_rate", "success_rate", "_ms"))]
     return report(args, folder, values, "Rescue of jumps", keys)
 
