@@ -1,6 +1,6 @@
 """Record the conformance vectors of policies again, after a policy has changed.
 
-    python -m docs.conformance_vectors vertical_jump horizontal_jump walking_flat
+    python -m docs.conformance_vectors vertical_jump horizontal_jump walking
 
 It writes `assets/conformance/NAME.npz` for bundles and `NAME.json` for programs without NumPy.
 """

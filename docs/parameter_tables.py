@@ -94,7 +94,7 @@ def body() -> str:
         "parameter | value | unit | source",
         [
             ("total mass", number(robot.mass), "kg", PAPER),
-            ("body, with payload", mass["body"], "kg", "total less the CAD export's legs"),
+            ("body, with payload", mass["body"], "kg", "total minus the legs of the CAD export"),
             ("motor housing with three motors", mass["housing"], "kg", CAD),
             ("thigh", mass["outer_thigh"], "kg", CAD),
             ("outer shank", mass["outer_shank"], "kg", CAD),
@@ -105,7 +105,7 @@ def body() -> str:
             ("outer axis x, from the hip", f"±{number(front.outer_x)}", "m", CAD),
             ("inner axis x, from the hip", f"±{number(front.inner_x)}", "m", CAD),
             ("plane of the thighs, y from the hip", f"±{number(front.plane_y)}", "m", CAD),
-            ("knees and ankle, y from that plane", f"±{number(front.knee_y)}", "m", CAD),
+            ("knees and ankle, y from the plane of the thighs", f"±{number(front.knee_y)}", "m", CAD),
             ("thigh length", number(front.thigh), "m", PAPER),
             ("shank length", number(front.shank), "m", PAPER),
             ("paw radius", number(front.paw_radius), "m", CAD),
@@ -130,8 +130,8 @@ def motors() -> str:
             row("rotor inertia", "kg m²", CONFIG, lambda m: m.rotor_inertia),
             row("armature: rotor inertia × ratio²", "kg m²", "computed", lambda m: m.armature),
             row("peak torque", "N m", PAPER, lambda m: m.peak_torque),
-            row("cutoff speed: full torque up to here", "rad/s", CONFIG, lambda m: m.cutoff_speed),
-            row("no-load speed: no torque from here", "rad/s", CONFIG, lambda m: m.no_load_speed),
+            row("cutoff speed: full torque up to this speed", "rad/s", CONFIG, lambda m: m.cutoff_speed),
+            row("no-load speed: no torque from this speed on", "rad/s", CONFIG, lambda m: m.no_load_speed),
             row("Coulomb friction", "N m", "inside the paper's range", lambda m: m.coulomb_friction),
             row("kp", "N m/rad", CONFIG, lambda m: m.jumping.kp),
             row("kd, jumping", "N m s/rad", CONFIG, lambda m: m.jumping.kd),
@@ -148,7 +148,7 @@ def passive() -> str:
     return table(
         "parameter | value | unit | source",
         [
-            ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, cut to what the shell allows"),
+            ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, limited by the shell"),
             ("stops, transversal", degrees(outer.lower, outer.upper), "deg", CONFIG),
             ("stops, outer + inner", degrees(*robot.transversal_sum), "deg", CONFIG),
             ("stiffness of the stops", number(LIMIT_STIFFNESS), "N m/rad", "numerical"),

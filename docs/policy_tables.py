@@ -82,7 +82,7 @@ def kind_of(task: TaskCfg) -> str:
 def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
     """Return the range of commands that a task samples in training, as text; values: conditions of a row.
 
-    They are jumps [m], velocities ahead / back, aside and about z, or else turns [deg].
+    They are jumps [m], velocities, or else turns [deg].
     """
     if pair := values.get("trained_range_m"):
         levels: Any = task.levels
@@ -91,10 +91,10 @@ def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
         if kind_of(task) == "height":
             return "{:g} to {:g} m".format(*pair)
         if back > 0.0:
-            return f"up to {pair[1]:g} m ahead, {aside:g} m aside, {back:g} m back"
-        return f"{pair[0]:g} to {pair[1]:g} m ahead, {aside:g} m aside"
+            return f"up to {pair[1]:g} m ahead, {aside:g} m to each side, {back:g} m back"
+        return f"{pair[0]:g} to {pair[1]:g} m ahead, {aside:g} m to each side"
     if limits := values.get("trained_velocities"):
-        return "{:g} / -{:g} m/s, ±{:g} m/s, ±{:g} rad/s".format(*limits)
+        return "{1:g} m/s back to {0:g} m/s ahead, ±{2:g} m/s sideways, turns of ±{3:g} rad/s".format(*limits)
     angles = [angle for level in task.levels for angle in level.angle]
     return f"{min(angles):g} to {max(angles):g}°"
 
@@ -163,9 +163,9 @@ def main_table(policy: str, task: TaskCfg) -> str:
         on_robot = " / ".join(filter(None, (cell(line, metrics) for metrics in robot.values())))
         lines.append([*cells, on_robot] if robot else cells)
     nominal = rows["nominal"]
-    note = f"{trials_of(nominal)} trials a column; commands: {nominal.values['commands']}"
+    note = f"Each column is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}"
     if kind_of(task) == "height":
-        note += "; in range: " + goals_in_range(nominal.metrics["in_range_success_rate"])
+        note += ", in range: " + goals_in_range(nominal.metrics["in_range_success_rate"])
     note += f".\n{together.capitalize()}: {' / '.join(robot)}" if robot else ""
     return markdown(["", *titles, *([together] if robot else [])], lines) + f"\n{note}.\n"
 
@@ -177,8 +177,8 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
     nominal = rows["nominal"]
-    note = f"{trials_of(nominal)} trials a row; commands: {nominal.values['commands']}.\n"
-    note += f"Trained on {trained_on(task, nominal.values)}.\n"
+    note = f"Each row is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}.\n"
+    note += f"Commands of the training: {trained_on(task, nominal.values)}.\n"
     reasons = [
         f"Not measured: {title}, since {reason}.\n"
         for name, (title, _) in CONDITIONS.items()
@@ -224,7 +224,11 @@ def measured_table(name: str) -> str:
         "machine": [row["machine"] for row in rows],
         "commit": [f"{row['commit']}, {row['date']}" for row in rows],
     }
-    shared = [values[0] for values in origins.values() if len(set(values)) == 1]
+    shared = [
+        values[0] if title == "machine" else f"commit {values[0]}"
+        for title, values in origins.items()
+        if len(set(values)) == 1
+    ]
     varying = {title: values for title, values in origins.items() if len(set(values)) > 1}
     lines = [[*row["cells"], *(values[i] for values in varying.values())] for i, row in enumerate(rows)]
     text = markdown((*table["columns"], *varying), lines)

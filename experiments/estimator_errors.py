@@ -1,7 +1,7 @@
 """Measure the state estimator's errors on recorded motions of a policy, and write metrics and a plot.
 
     python experiments/estimator_errors.py --policy vertical_jump --joint-offset 0.3 --out outputs/estimator
-    python experiments/estimator_errors.py --policy walking_flat --joint-offset 2
+    python experiments/estimator_errors.py --policy walking --joint-offset 2
 
 Every physics step of SolverJumper is a tick of the estimator. IMU readings have noise and a drawn bias, joint angles
 noise and a drawn offset; each motion is repeated with several draws. Jumps are compared in the last tick of their

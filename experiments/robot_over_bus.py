@@ -33,7 +33,7 @@ from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.output import output_dir
 from support.scripts import OutputArgs, run_script
 
-POLICIES = {State.JUMP_UP: "vertical_jump", State.JUMP_TO: "horizontal_jump", State.WALK: "walking_flat"}
+POLICIES = {State.JUMP_UP: "vertical_jump", State.JUMP_TO: "horizontal_jump", State.WALK: "walking"}
 TOLERANCE = 0.1  # [m] of apex and landing
 LOWEST, MOST_TILT = 0.10, np.radians(60.0)  # [m], [rad] height and tilt of a base beyond which it has fallen
 GYRO_NOISE, ACCEL_NOISE = 3.0e-4, 2.0e-3  # [rad/s/√Hz], [m/s^2/√Hz]
@@ -233,7 +233,7 @@ def main(args: Args) -> dict:
             commands = rng.uniform((-0.5, -0.3, -0.8), (1.0, 0.3, 0.8), (10, 3))
             runs = [run(State.WALK, commands, steps) for run in (bench.over_bus, bench.directly)]
             minutes.append([tracking_error(run, commands, steps) for run in runs])
-        metrics |= summary("walking_flat", np.array(minutes).reshape(-1, 2), tolerance=np.finfo(float).max)
+        metrics |= summary("walking", np.array(minutes).reshape(-1, 2), tolerance=np.finfo(float).max)
         low, high = (0.6, 0.3, -0.2, 0.2, 0.2), (0.95, 1.0, 0.2, 0.8, 0.8)
         courses = [bench.course(rng.uniform(low, high)) for _ in range(args.courses)]
         metrics |= {"courses": len(courses), "courses_done": int(np.sum(courses))}

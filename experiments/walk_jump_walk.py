@@ -43,7 +43,7 @@ PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turni
 class Args(EvaluationArgs):
     """Flags of the test of a robot that switches between walking and jumping policies."""
 
-    policy: str = "walking_flat"  # Policy that walks: name or folder, a run's folder, or a checkpoint
+    policy: str = "walking"  # Policy that walks: name or folder, a run's folder, or a checkpoint
     jump_up: str = "vertical_jump"  # Policy that jumps to heights
     jump_to: str = "horizontal_jump"  # Policy that jumps to places
     num_robots: int = 200  # Number of robots; each has its own commands

@@ -1,7 +1,7 @@
 """Measure how far a policy walks on slopes, stairs, uneven ground and under kicks, and write metrics and recordings.
 
-    python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
-    python experiments/walking_terrain.py --policy walking_flat --terrains flat --kick 0.5 --randomize
+    python experiments/walking_terrain.py --policy walking --num-robots 500 --out outputs/terrain
+    python experiments/walking_terrain.py --policy walking --terrains flat --kick 0.5 --randomize
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
 They do not observe the terrain. The metric of a terrain is the mean fraction of the commanded distance that they walk
@@ -57,7 +57,7 @@ class KickedWalks(VelocityLog):
 class Args(EvaluationArgs):
     """Flags of the test of walking on terrains."""
 
-    policy: str = "walking_rough"
+    policy: str = "walking"
     num_robots: int = 500  # Robots on each terrain
     terrains: tuple[str, ...] = KINDS  # Terrains to walk on
     speed: float = 0.5  # [m/s] Commanded velocity straight ahead

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from jumper_warp.policies.policy import actor_init_from_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
-from jumper_warp.rl import seeds as several
 from jumper_warp.rl.run_folder import TrainResult
 from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
@@ -43,7 +42,4 @@ def train(
     actor_init = None
     if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
-    if cfg.seeds:
-        return several.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
-    checkpoint = checkpoints[0] if checkpoints else None
-    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoint, observers)
+    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)

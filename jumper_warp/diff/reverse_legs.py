@@ -29,12 +29,12 @@ class LegThreadReverse:
         self._modules = dynamics.modules
         self._device = dynamics.model.device
         self._num = dynamics.model.world_count
-        module = self._modules.leg_record
-        shape = {"dtype": dynamics.real, "device": self._device}
-        self._record = module.LegRecord()
-        entries = SPAN * (every + 1)
-        self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
-        self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
+        kind = self._modules.leg_adjoint.LegRecord
+        self._record = kind()
+        shape = (SPAN * (every + 1), self._num, 4)
+        for name, field in kind.vars.items():
+            array = wp.zeros(shape[: field.type.ndim], dtype=field.type.dtype, device=self._device)
+            setattr(self._record, name, array)
 
     def run(self, settings: KernelStruct, motion: list, cotangents: KernelStruct, gradients: KernelStruct) -> None:
         """Backpropagate through a rollout, and add the gradients w.r.t. its inputs to `gradients`.

@@ -69,7 +69,7 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
     episode.purpose = PURPOSES.index(stream)
     episode.skill = skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
-              "streak")  # fmt: skip
+              "streak", "listed", "num_listed")  # fmt: skip
     allocate(episode, ("pending_command",), num_envs, wp.vec4, device)
     allocate(episode, counts, num_envs, int, device)
     allocate(episode, ("reward", "done", "timeout"), num_envs, float, device)

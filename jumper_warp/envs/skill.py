@@ -276,7 +276,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))
     begins = (task.reset.func, task.settings_type, task.level_type, task.command.resample_due, task.command.resample)
     return {
-        "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor),
+        "step": _kernel(make_step_kernel, task, task.state, ends, task.reward_floor, task.command.resample_due),
         "reset": _kernel(make_reset_kernel, task, task.state, begins),
         "set_command": _kernel(make_set_command_kernel, task, task.state, task.command.set),
         "observe": _kernel(

@@ -61,6 +61,14 @@ class WorldSlice(NamedTuple):
     episode: KernelStruct  # The kernels' `EpisodeArrays` that begin at `first`
 
 
+def _changed(episode: KernelStruct, **numbers: int) -> KernelStruct:
+    """Return a copy of `EpisodeArrays`, of the same arrays, with some of its numbers changed."""
+    changed = EpisodeArrays()
+    for name in EpisodeArrays.vars:
+        setattr(changed, name, numbers.get(name, getattr(episode, name)))
+    return changed
+
+
 class Stages(Uncopied):
     """Arrays and kernel launches of an environment; `Env` adds the public methods."""
 
@@ -132,12 +140,8 @@ class Stages(Uncopied):
         worlds = check_worlds(worlds, self.num_envs)
         if worlds.count == self.num_envs:
             return WorldSlice(0, self.num_envs, self.episodes)
-        env = EpisodeArrays()
-        for name in EpisodeArrays.vars:
-            setattr(env, name, getattr(self.episodes, name))
-        env.first = worlds.first
-        env.slice = self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
-        return WorldSlice(*worlds, env)
+        index = self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
+        return WorldSlice(*worlds, _changed(self.episodes, first=worlds.first, slice=index))
 
     def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
         """Return the stages of a policy step by name, in order: functions that launch some kernels without waiting.
@@ -196,6 +200,8 @@ class Stages(Uncopied):
         """Switch worlds to another task where due, reset ended episodes (with auto_reset), and observe both again."""
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
+        if begins and not self._handovers and self._reset_mask is self.episodes.done:
+            part = part._replace(episode=_changed(part.episode, listed_only=1))
         if begins:
             self._reset_worlds(part, self._reset_mask)
         if self._handovers or begins:

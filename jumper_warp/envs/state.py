@@ -20,8 +20,8 @@ from jumper_warp.utils.streams import purpose_seed
 if TYPE_CHECKING:
     from jumper_warp.envs.stages import Stages
 
-CONSTANT = ("gravity", "default_angle", "paw_shapes")
-"""Arrays of the kernels' structs that are not saved because they are constant, like those named `nominal_*`."""
+CONSTANT = ("gravity", "default_angle", "paw_shapes", "listed", "num_listed")
+"""Arrays of the kernels' structs that are not saved: constant, like those named `nominal_*`, or set in each step."""
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
 """Names of the saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint

@@ -11,6 +11,6 @@ WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a h
 class SkillNames:
     """Names or folders of three policies: for walking, for vertical jumps and for horizontal jumps."""
 
-    walk: str = "walking_flat"  # Policy that follows commanded velocities
+    walk: str = "walking"  # Policy that follows commanded velocities
     jump_up: str = "vertical_jump"  # Policy that jumps to a commanded height
     jump_to: str = "horizontal_jump"  # Policy that jumps to a commanded position

@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from jumper_warp.diff.bodies import PAIRS
 from jumper_warp.diff.rollout import Rollout
 from jumper_warp.identification.initial_states import InitialStates
 from jumper_warp.kernels import layout
@@ -25,6 +24,7 @@ from jumper_warp.sim.dynamics import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # entries of packed second moments of mass
 TOLERANCE = 1.0e-10  # [m/s] tolerance of the contact iteration, whose error finite differences of replays inherit
 
 

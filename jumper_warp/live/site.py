@@ -29,11 +29,11 @@ TERMS = frozenset({
     "last_action", "block_ahead", "way",
 })  # fmt: skip
 """Observation terms that the page computes; `TERMS` in page/policy.js has the same names."""
-EARTH = {"walk": "walking_flat", "jump_up": "vertical_jump", "jump_to": "horizontal_jump"}
+EARTH = {"walk": "walking", "jump_up": "vertical_jump", "jump_to": "horizontal_jump"}
 SCENES = {
     "plain": EARTH,
     "blocks": EARTH | {"jump_to": "sighted_jump"},
-    "rough": EARTH | {"walk": "walking_rough"},
+    "rough": EARTH,
     "mars": EARTH | {"jump_up": "mars_vertical_jump", "jump_to": "mars_horizontal_jump"},
 }
 """Name of the policy of each skill by scene of the page."""

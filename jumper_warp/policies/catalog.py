@@ -41,6 +41,7 @@ PURPOSE = "file of a policy"
 REPLACED = {
     "slippery_jump": "horizontal_jump", "slippery_waiting_jump": "horizontal_jump",
     "omnidirectional_jump": "horizontal_jump", "mars_vertical_jump_stock": "mars_vertical_jump",
+    "walking_flat": "walking", "walking_rough": "walking",
 }  # fmt: skip
 """Policy in place of each earlier one."""
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")

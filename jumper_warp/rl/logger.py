@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import socket
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,12 +18,51 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.events_file import EventsFile
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
+from jumper_warp.rl.resume import flat_settings
 from jumper_warp.rl.run_names import SEED, title
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.metrics import mean
 from jumper_warp.utils.progress import format_duration
+
+BUFFER = 2**20  # [byte] More than the events of an iteration
+
+
+class EventsFile:
+    """File of TensorBoard events of a training; `add` writes them, also those of the constructor."""
+
+    def __init__(self, folder: Path, iteration: int, config: Json) -> None:
+        """Create the file in a run's folder, with settings as hparams; hide events after `iteration` in older files.
+
+        config: JSON-ready configuration of the run. Raises OSError: the file cannot be created.
+        """
+        from tensorboard.summary.writer.record_writer import RecordWriter
+        from torch.utils.tensorboard.summary import hparams
+
+        self._proto: Any = importlib.import_module("tensorboard.compat.proto.event_pb2")
+        name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{time.time_ns()}"
+        self._records = RecordWriter((folder / name).open("xb", buffering=BUFFER))
+        self._write(file_version="brain.Event:2")
+        if iteration:
+            self._write(step=iteration + 1, session_log={"status": self._proto.SessionLog.START})
+        settings = {key: value for key, value in flat_settings(config).items() if isinstance(value, bool | int | float)}
+        for summary in hparams(settings, {"Metrics/success": 0.0}):
+            self._write(summary=summary)
+
+    def add(self, iteration: int, metrics: dict[str, float]) -> None:
+        """Write the metrics of an iteration by name. Raises OSError, such as on a full disk."""
+        values = [{"tag": name, "simple_value": value} for name, value in metrics.items()]
+        self._write(step=iteration, summary={"value": values})
+        self._records.flush()
+
+    def close(self) -> None:
+        """Close the file. Raises OSError: events cannot be written."""
+        self._records.close()
+
+    def _write(self, **fields: Any) -> None:
+        """Write an event to the buffer; fields: those of TensorBoard's `Event`."""
+        self._records.write(self._proto.Event(wall_time=time.time(), **fields).SerializeToString())
 
 
 class Stopwatch:
@@ -61,18 +101,17 @@ class Stopwatch:
 
 
 class TrainingConsole:
-    """Context manager of the terminal's lines and progress bar of a training."""
+    """Context manager of the terminal's lines and progress bar of a training, or of several seeds together."""
 
-    brief = False  # Whether the end of a training is left out, since it is printed for all seeds together
-
-    def __init__(self, cfg: TrainCfg) -> None:
-        """Prepare the terminal; cfg: of the training."""
-        self._console = _PipeSafeConsole(stderr=True)
+    def __init__(self, cfg: TrainCfg, *, quiet: bool = False) -> None:
+        """Prepare the terminal; cfg: of the training. quiet: print nothing."""
+        self._console = _PipeSafeConsole(stderr=True, quiet=quiet)
         self._total, self._steps = cfg.max_iterations, cfg.ppo.num_steps * cfg.num_envs * max(1, len(cfg.seeds))
         wrapped = TextColumn("{task.description}", table_column=Column(no_wrap=False))
         columns, hidden = (TimeElapsedColumn(), BarColumn(bar_width=12), wrapped), not self._console.is_terminal
         self._progress = Progress(*columns, console=self._console, disable=hidden)
         self._task = self._progress.add_task("training", total=None)
+        self._logged: list[dict[str, float]] = []
 
     def __enter__(self) -> TrainingConsole:
         """Show the training's progress bar."""
@@ -89,98 +128,52 @@ class TrainingConsole:
         with suppress(OSError):
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def show(self, iteration: int, seeds: Sequence[dict[str, float]], remaining: float) -> None:
-        """Show the metrics of each seed in an iteration; remaining: estimated time to the end [s]."""
-        elapsed = max(metrics["Perf/elapsed_s"] for metrics in seeds)
-        rate = sum(metrics["Perf/total_fps"] for metrics in seeds)
-        progress = f"iteration {iteration}/{self._total}, {iteration * self._steps / 1.0e6:.2f} M steps"
-        line = f"{progress}: {rate:,.0f} steps/s{_summary(seeds)}, {format_duration(remaining)} left"
-        self._progress.update(self._task, completed=elapsed, total=elapsed + remaining, description=line)
-        if not self._console.is_terminal:
-            self.print_line(line)
-
-
-class SeedsConsole(TrainingConsole):
-    """Terminal of several seeds: one line for all of them, with means and intervals over the seeds."""
-
-    def __init__(self, cfg: TrainCfg, *, quiet: bool = False) -> None:
-        """Prepare the terminal; cfg: of the training. quiet: print nothing."""
-        super().__init__(cfg)
-        self._console.quiet = quiet
-        self._logged: dict[int, dict[str, float]] = {}
-        self._last = (0, 0.0)
-
-    def of_seed(self, seed: int) -> SeedConsole:
-        """Return the console that the log of one seed uses."""
-        return SeedConsole(self, seed)
-
-    def add(self, seed: int, iteration: int, metrics: dict[str, float], remaining: float) -> None:
-        """Keep the metrics of a seed for the next `flush`."""
-        self._logged[seed] = metrics
-        self._last = (iteration, remaining)
+    def add(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
+        """Keep the metrics of a seed for the next `flush`; remaining: estimated time to the end [s]."""
+        self._logged.append(metrics)
+        self._iteration, self._remaining = iteration, remaining
 
     def flush(self) -> None:
-        """Show the metrics that the seeds have logged since the last call, if any."""
-        if self._logged:
-            iteration, remaining = self._last
-            self.show(iteration, list(self._logged.values()), remaining)
-            self._logged = {}
-
-
-class SeedConsole:
-    """Console of one of several seeds: its lines begin with the seed, its metrics are shown with those of others."""
-
-    brief = True
-
-    def __init__(self, console: SeedsConsole, seed: int) -> None:
-        """Write to the console of all seeds."""
-        self._console, self._seed = console, seed
-
-    def __enter__(self) -> SeedConsole:
-        """Return this console; that of all seeds is open."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: the console of all seeds stays open."""
-
-    def print_line(self, line: str) -> None:
-        """Print a line with the seed."""
-        self._console.print_line(f"seed {self._seed}: {line}")
-
-    def show(self, iteration: int, seeds: Sequence[dict[str, float]], remaining: float) -> None:
-        """Keep the metrics until those of all seeds are shown."""
-        self._console.add(self._seed, iteration, seeds[0], remaining)
+        """Show the metrics that were logged since the last call, if any; of several seeds, means and intervals."""
+        seeds, self._logged = self._logged, []
+        if not seeds:
+            return
+        elapsed = max(metrics["Perf/elapsed_s"] for metrics in seeds)
+        rate = sum(metrics["Perf/total_fps"] for metrics in seeds)
+        progress = f"iteration {self._iteration}/{self._total}, {self._iteration * self._steps / 1.0e6:.2f} M steps"
+        line = f"{progress}: {rate:,.0f} steps/s{_summary(seeds)}, {format_duration(self._remaining)} left"
+        self._progress.update(self._task, completed=elapsed, total=elapsed + self._remaining, description=line)
+        if not self._console.is_terminal:
+            self.print_line(line)
 
 
 class TrainingLog:
     """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
 
     def __init__(
-        self, folder: Path, config: dict[str, Any], cfg: TrainCfg, iteration: int = 0,
-        console: TrainingConsole | SeedConsole | None = None,
-    ) -> None:  # fmt: skip
+        self, folder: Path, config: dict[str, Any], cfg: TrainCfg, console: TrainingConsole, iteration: int = 0
+    ) -> None:
         """Open the metrics file and the other outputs of the log; folder: the run's existing folder.
 
-        config: JSON-ready configuration of the run. cfg: settings of the training. iteration: iterations so far; lines
-        logged of later iterations are removed. console: that shows progress (default: a new one).
+        config: JSON-ready configuration of the run. cfg: settings of the training. console: that shows lines and
+        progress. iteration: iterations so far; lines logged of later iterations are removed.
         Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
-        self.console = TrainingConsole(cfg) if console is None else console
+        self._console = console
+        self._prefix = f"seed {cfg.seed}: " if folder.name.startswith(SEED) else ""
         self._file = MetricsFile(folder / METRICS_FILE, iteration)
         self._events = EventsFile(folder, iteration, config) if cfg.tensorboard else None
         self._disk_full = False
         self._wandb = _wandb(cfg.wandb, folder, config, cfg) if cfg.wandb else None
 
     def __enter__(self) -> TrainingLog:
-        """Show the training's progress bar; report lines that were removed from the metrics file."""
-        self.console.__enter__()
+        """Report lines that were removed from the metrics file."""
         if self._file.dropped:
             self.print_line(f"{self._file.path}: removed {self._file.dropped} incomplete or later lines")
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close all outputs of the log: file, terminal, TensorBoard and Weights & Biases."""
-        self.console.__exit__()
+        """Close all outputs of the log: file, TensorBoard and Weights & Biases."""
         for close in (self._file.close, *([self._events.close] if self._events else [])):
             with suppress(OSError):
                 close()
@@ -188,8 +181,8 @@ class TrainingLog:
             self._wandb.finish()
 
     def print_line(self, line: str) -> None:
-        """Print a line above the progress bar."""
-        self.console.print_line(line)
+        """Print a line above the progress bar, of one of several seeds with the seed."""
+        self._console.print_line(self._prefix + line)
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
         """Log the metrics of an iteration by name, such as `Loss/value`; remaining: estimated time to the end [s]."""
@@ -203,7 +196,7 @@ class TrainingLog:
         self._write_events(iteration, metrics)
         if self._wandb:
             self._wandb.log(metrics, step=iteration)
-        self.console.show(iteration, [metrics], remaining)
+        self._console.add(iteration, metrics, remaining)
 
     def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
         """Write an iteration's metrics as TensorBoard events; the first failure disables events."""

@@ -8,24 +8,81 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+
+import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl import distributed, resume
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
-from jumper_warp.rl.clock import TrainingClock, is_last_iteration
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
-from jumper_warp.rl.logger import NoLog, Scores, SeedConsole, Stopwatch, TrainingConsole, TrainingLog
+from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingConsole, TrainingLog
 from jumper_warp.rl.run_folder import CONFIG, TrainResult, full_config, new_folder, report_non_finite, write_config
 from jumper_warp.rl.run_names import CHECKPOINTS, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
+
+
+class TrainingClock:
+    """Clock of a training over all resumes, and its limits `max_iterations` and `max_seconds`.
+
+    It runs from `start`, which a training calls at the end of a process's first iteration.
+    """
+
+    def __init__(self, cfg: TrainCfg) -> None:
+        """Read the limits from the settings of a training."""
+        self.cfg = cfg
+        self.seconds = 0.0  # of the run before this process [s]
+        self._begin: float | None = None  # time at which the run would have started without interruption
+
+    @property
+    def started(self) -> bool:
+        """Whether `start` was called."""
+        return self._begin is not None
+
+    def start(self, device: torch.device) -> None:
+        """Start counting the training time, after synchronising with the device."""
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        self._begin = time.perf_counter() - self.seconds
+
+    def elapsed(self) -> float:
+        """Return the training time [s] over all resumes, counted as for `TrainCfg.max_seconds`."""
+        return self.seconds if self._begin is None else time.perf_counter() - self._begin
+
+    def is_over_time(self) -> bool:
+        """Return whether the training time has reached `max_seconds`."""
+        return 0.0 < self.cfg.max_seconds <= self.elapsed()
+
+    def progress(self, iteration: int) -> float:
+        """Return the progress of the training, 0 to 1: the greater fraction of max_iterations and max_seconds."""
+        of_time = self.elapsed() / self.cfg.max_seconds if self.cfg.max_seconds > 0.0 else 0.0
+        return max(iteration / self.cfg.max_iterations, of_time)
+
+    def remaining(self, iteration: int, seconds: float) -> float:
+        """Return the estimated time to the end [s]; seconds: duration of an iteration [s]."""
+        remaining = (self.cfg.max_iterations - iteration) * seconds
+        if self.cfg.max_seconds > 0.0:
+            remaining = min(remaining, max(self.cfg.max_seconds - self.elapsed(), 0.0))
+        return remaining
+
+    def limit(self, iteration: int) -> str:
+        """Return the limit that ends the training after `iteration`, as a flag such as `--max-iterations 500`."""
+        if iteration >= self.cfg.max_iterations:
+            return f"--max-iterations {self.cfg.max_iterations}"
+        return f"--max-seconds {self.cfg.max_seconds:g}"
+
+
+def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
+    """Return whether a run ends after `iteration` iterations; end_early: a stop request or the time limit."""
+    return end_early or iteration >= cfg.max_iterations
+
 
 PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
 """Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
@@ -37,19 +94,19 @@ class TrainingRun:
     """State of a training in this process: algorithm, environment, folder, iteration, time."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None, *, folder: Path | None = None,
-        console: TrainingConsole | SeedConsole | None = None, stream: AbstractContextManager[None] | None = None,
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, console: TrainingConsole, stream: AbstractContextManager,
+        command: str | None = None, actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None,
+        folder: Path | None = None,
     ) -> None:  # fmt: skip
         """Build the algorithm, and load the checkpoint, else apply `actor_init` if given.
 
-        command, actor_init, checkpoint: as in `train`. folder: of a new run (default: a new one, by
-        time). console: shows lines and progress (default: a new one). stream: context in which all work of the run is
-        enqueued (default: the current stream). Raises InputError or CheckpointError as `train`.
+        console: shows lines and progress. stream: context in which all work of the run is enqueued. command,
+        actor_init, checkpoint: as in `train`. folder: of one of several seeds (default: a new one, by time). Raises
+        InputError or CheckpointError as `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
-        self.stream = nullcontext() if stream is None else stream
+        self.stream, self._console, self._is_single = stream, console, folder is None
         self.ppo = make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in STATISTICS}
         self._logged = {*env.metrics(), *losses, *LEARNING, *PERF}  # Names of the logged metrics
@@ -76,10 +133,8 @@ class TrainingRun:
             folder.mkdir(parents=True)
         else:
             self.folder = new_folder(cfg, rank)
-        if console is None:
+        if self._is_single:
             self.notes.insert(0, f"run {self.folder}")
-            console = TrainingConsole(cfg)
-        self._console = console
         if rank.index == 0:
             write_config(self.folder, self.config)
 
@@ -165,9 +220,15 @@ class TrainingRun:
             self.metrics = self._read_metrics(times)
             self._scores.add(self.metrics)
             log.log(self.iteration, self.metrics, self.clock.remaining(self.iteration, seconds))
+            if self._is_single:
+                self._console.flush()
         elif self.iteration == self._first_iteration:
             watch.read()  # the rate in the log leaves the warm-up out
-        if is_last and not self.failure and not self._console.brief:
+        if is_last and self.failure and not self._is_single:
+            log.print_line(f"frozen at iteration {self.iteration}: {self.failure}")
+            with suppress(OSError):
+                (self.folder / resume.FROZEN).write_text(f"iteration {self.iteration}: {self.failure}\n")
+        elif is_last and not self.failure and self._is_single:
             log.print_line(f"ended by {self.reason(stop)}")
         if (is_last or saves) and self._is_finite:
             self._save(is_last, stop)
@@ -182,7 +243,7 @@ class TrainingRun:
         """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
         if self.rank.index != 0:
             return NoLog()
-        return TrainingLog(self.folder, self.config, self.cfg, self.iteration, self._console)
+        return TrainingLog(self.folder, self.config, self.cfg, self._console, self.iteration)
 
     def _steps(self) -> int:
         """Return the number of environment steps in an iteration, of all worlds."""
@@ -252,7 +313,7 @@ class TrainingRun:
             self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         self._scores.clear()
-        if is_last and not self._console.brief:
+        if is_last and self._is_single:
             hint = f", continue with: {self.resume_command}"
             self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
 

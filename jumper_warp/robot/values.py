@@ -29,20 +29,20 @@ class RobotValues:
     base_mass: np.ndarray  # (N, 1) [kg] Mass of the base link
     base_com: np.ndarray  # (N, 3) [m] Centre of mass of the base link, in its frame
     base_inertia: np.ndarray
-    """(N, 1) [1] Factor on the described inertia about the centre of mass, in addition to the ratio of base masses."""
+    """(N, 1) [1] Factor on the described inertia about the centre of mass, which also scales with `base_mass`."""
     link_mass: np.ndarray  # (N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`
     armature: np.ndarray  # (N, 12) [kg m^2] Rotor inertia at the gear's output
     motor_friction: np.ndarray  # (N, 12) [N m] Coulomb friction at the gear's output
     kp: np.ndarray  # (N, 12) [1] Ratio to the gain of the motion or task
     kd: np.ndarray  # (N, 12) [1] Ratio to the gain of the motion or task
     saturation: np.ndarray  # (N, 12) [1] Ratio to the torque limit of the motion or task
-    peak: np.ndarray  # (N, 12) [1] Ratio to the peak torque of the left front leg's motor of its kind
+    peak: np.ndarray  # (N, 12) [1] Ratio to the peak torque of the left front leg's same motor
     no_load_speed: np.ndarray  # (N, 12) [rad/s] Speed at which a motor has no torque left
-    cutoff_speed: np.ndarray  # (N, 12) [rad/s] Speed above which the available torque falls; below `no_load_speed`
+    cutoff_speed: np.ndarray  # (N, 12) [rad/s] Speed above which the torque falls; less than `no_load_speed`
     offset: np.ndarray  # (N, 12) [rad] Position sensor's reading minus the true angle
     knee_damping: np.ndarray  # (N, 1) [N m s/rad] Viscous damping of each knee
     paw_friction: np.ndarray  # (N, 1) [1] Static and dynamic friction coefficient of the paws
-    latency: np.ndarray  # (N, 1) [s] From a commanded target to its effect on the motor
+    latency: np.ndarray  # (N, 1) [s] Delay from a commanded target to its effect on the motor
     spring_stiffness: np.ndarray  # (N, 1) [N/m] Stiffness of the spring between the two knees of each leg; 0: no spring
     spring_length: np.ndarray  # (N, 1) [m] Rest length of these springs
 

@@ -377,9 +377,7 @@ class Simulation(Uncopied):
         They are computed from the joint coordinates; the state does not change. pose: position [m] and quaternion
         (xyzw); twist: velocity of the COM [m/s] and angular velocity [rad/s]. Waits for the device.
         """
-        if self._links is None:
-            self._links = self.model.state()
-        state = self._links
+        state = self._links = self._links or self.model.state()
         wp.copy(state.joint_q, self.state.joint_q)
         wp.copy(state.joint_qd, self.state.joint_qd)
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)

@@ -144,11 +144,11 @@ class SolverJumper(SolverBase):
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces of a control and the body wrenches of a state, or zeros where they are None."""
         self._check_state("state_in", state)
-        control = self._default_control if control is None else control
         body_f = self._no_body_f if state.body_f is None else state.body_f
-        self._check("control.joint_f", getattr(control, "joint_f", None), self._state_shapes["joint_qd"])
+        joint_f = (control or self._default_control).joint_f
+        self._check("control.joint_f", joint_f, self._state_shapes["joint_qd"])
         self._check("state_in.body_f", body_f, self._state_shapes["body_q"])
-        return control.joint_f, body_f
+        return joint_f, body_f
 
     def _check(self, name: str, array: wp.array | None, shape: tuple[int, ...]) -> None:
         """Raise InputError unless an array has the given shape and is on the model's device; kernels check neither."""

@@ -27,14 +27,9 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        model: Model,
-        worlds: Sequence[int] = (0,),
-        *,
-        spacing: float = 0.0,
-        notes: Mapping[str, Any] | None = None,
-        labels: Sequence[str] = (),
-    ) -> None:
+        self, model: Model, worlds: Sequence[int] = (0,), *, spacing: float = 0.0,
+        notes: Mapping[str, Any] | None = None, labels: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         """Prepare to record some worlds of a Newton model; its bodies and shapes are read here, once.
 
         spacing: distance [m] along y between the drawings of consecutive worlds; 0 for true positions, required for a
@@ -76,16 +71,10 @@ class Recorder:
         self._commands: list[np.ndarray] = []
 
     def record(
-        self,
-        time: float,
-        body_poses: wp.array | np.ndarray,
-        series: Mapping[str, float] | None = None,
-        contact_points: np.ndarray | None = None,
-        contact_forces: np.ndarray | None = None,
-        *,
-        states: Mapping[str, str] | None = None,
-        commands: np.ndarray | None = None,
-    ) -> None:
+        self, time: float, body_poses: wp.array | np.ndarray, series: Mapping[str, float] | None = None,
+        contact_points: np.ndarray | None = None, contact_forces: np.ndarray | None = None, *,
+        states: Mapping[str, str] | None = None, commands: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Record the current state as a frame; its time stamp [s] must be later than that of the previous frame.
 
         body_poses: of all bodies of the model, like `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
@@ -169,21 +158,13 @@ class Recorder:
             if name in marks and not fits:
                 raise InputError(f"{name} must have one row for each of {len(self._worlds)} worlds, got shape {shape}")
         series = np.stack(self._series[first:], axis=1)
+        points, forces = (np.stack(part) for part in zip(*self._contacts[first:], strict=True))
         return Recording(
-            times=np.array(self._times[first:]),
-            worlds=self._worlds,
-            bodies=self._names,
-            poses=np.stack(self._poses[first:]),
-            series=dict(zip(self._names_of_series, series, strict=True)),
-            contact_points=np.stack([points for points, _ in self._contacts[first:]]),
-            contact_forces=np.stack([forces for _, forces in self._contacts[first:]]),
-            spacing=self._spacing,
-            shapes=self._shapes,
-            notes=self._notes,
-            labels=self._labels,
-            states={name: [frame[name] for frame in self._states[first:]] for name in self._states[0]},
-            **marks,
-        )
+            np.array(self._times[first:]), self._worlds, self._names, np.stack(self._poses[first:]),
+            dict(zip(self._names_of_series, series, strict=True)), points, forces, self._spacing, self._shapes,
+            self._notes, self._labels,
+            {name: [frame[name] for frame in self._states[first:]] for name in self._states[0]}, **marks,
+        )  # fmt: skip
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording so far as a NumPy archive, which `load_npz` reads; return its path."""

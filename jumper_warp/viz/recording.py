@@ -20,15 +20,8 @@ from jumper_warp.viz.shapes import ShapeMesh, packed_shapes, unpacked_shapes
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
-ARRAYS = (
-    "times",
-    "poses",
-    "contact_points",
-    "contact_forces",
-    "goals",
-    "heights",
-    "commands",
-)  # fields of `Recording` that are arrays
+ARRAYS = "times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands"  # fields of `Recording`
+HEADER = "worlds", "bodies", "labels", "spacing", "notes", "states"  # fields of `Recording` in the header as they are
 MOTION = "motion/"  # Begin of the names of the file's arrays that `Recording.motion` holds
 FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
@@ -76,10 +69,7 @@ class Recording:
             return str(self.notes["title"])
         policy, task = (str(self.notes.get(key, "")) for key in ("policy", "task"))
         same = not policy or policy.replace("_", "-") == task
-        words = [
-            policy or task if same else f"{policy} ({task})",
-            *(self.label(rank) for rank in ranks if len(ranks) == 1),
-        ]
+        words = [policy or task if same else f"{policy} ({task})", *(map(self.label, ranks) if len(ranks) == 1 else ())]
         return "   ".join(filter(None, words))
 
     def body_poses(self, rank: int) -> np.ndarray:
@@ -97,18 +87,8 @@ class Recording:
     def save_npz(self, path: Path) -> Path:
         """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""
         entries, meshes = packed_shapes(self.shapes)
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "worlds": self.worlds,
-            "bodies": self.bodies,
-            "series": list(self.series),
-            "shapes": entries,
-            "spacing": self.spacing,
-            "notes": self.notes,
-            "labels": self.labels,
-            "states": self.states,
-        }
+        header = {"format": FORMAT, "version": VERSION, "series": list(self.series), "shapes": entries}
+        header |= {name: getattr(self, name) for name in HEADER}
         arrays = {name: getattr(self, name) for name in ARRAYS}
         arrays["header"] = np.array(json.dumps(header))
         series = np.array(list(self.series.values()), dtype=np.float64)
@@ -141,18 +121,11 @@ def load_npz(path: Path) -> Recording:
 
 def _from_archive(header: Json, archive: Mapping[str, np.ndarray]) -> Recording:
     """Build a recording, without checks, from a NumPy archive; header: its decoded JSON entry `header`."""
-    return Recording(
-        **{name: archive[name] for name in ARRAYS},
-        worlds=tuple(header["worlds"]),
-        bodies=tuple(header["bodies"]),
-        series=dict(zip(header["series"], archive["series"], strict=True)),
-        spacing=header["spacing"],
-        shapes=unpacked_shapes(header["shapes"], archive),
-        notes=header["notes"],
-        labels=tuple(header["labels"]),
-        states=header["states"],
-        motion={name.removeprefix(MOTION): values for name, values in archive.items() if name.startswith(MOTION)},
-    )
+    series = dict(zip(header["series"], archive["series"], strict=True))
+    motion = {name.removeprefix(MOTION): values for name, values in archive.items() if name.startswith(MOTION)}
+    values: Json = {name: header[name] for name in HEADER} | {name: tuple(header[name]) for name in HEADER[:3]}
+    values |= {name: archive[name] for name in ARRAYS}
+    return Recording(**values, series=series, shapes=unpacked_shapes(header["shapes"], archive), motion=motion)
 
 
 def _check(name: str, valid: Any) -> None:

@@ -35,6 +35,13 @@ SHANK_FREE = wp.constant(real(0.9))  # fraction of a shank, from the knee, that 
 SHANK_APART = wp.constant(real(0.5))  # fraction of a shank, from the knee, that must not touch the other shank
 FAR = wp.constant(real(1.0e6))  # [m] start value of a minimum of distances
 
+_ROLLED = """
+#if defined(__CUDA_ARCH__)
+    asm("" : "+r"(count));
+#endif
+    return count;
+"""
+
 mat53 = wp.types.matrix(shape=(5, 3), dtype=real)
 
 # boxes of a shell of factor 1 (`LegGeometry.shell`) in the body frame [m], one a row:
@@ -64,6 +71,12 @@ class Collisions:
 
     flags: int  # bitmask of BODY_GROUND to LEG_SHELL
     clearance: real  # [m] smallest distance of all, negative in contact
+
+
+@wp.func_native(_ROLLED)
+def rolled(count: int) -> int:
+    """Return `count`, hidden from a GPU's compiler, which cannot unroll a loop up to it: few threads wait for code."""
+    ...
 
 
 @wp.func
@@ -144,8 +157,7 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
     bounding_sq = segment_box_bound_sq(capsules.low - center, capsules.high - center, half)
     reach = bound + capsules.geometry.paw_radius
     if plane_gap < reach and bounding_sq < reach * reach:
-        count = wp.int32(5)
-        for k in range(count):
+        for k in range(rolled(5)):
             start = capsules.ends[k] - center
             end = capsules.ends[capsule_end(k)] - center
             radius = capsule_radius(capsules, k)
@@ -166,24 +178,32 @@ def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
 
 
 @wp.func
+def box_gap_sq(low: vec3, high: vec3, other_low: vec3, other_high: vec3) -> real:
+    """Return the squared distance [m^2] of two boxes along the axes, from their lowest and highest corners [m]."""
+    gap = wp.max(wp.max(other_low - high, low - other_high), vec3(real(0.0)))
+    return wp.dot(gap, gap)
+
+
+@wp.func
 def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> real:
     """Return the smallest distance [m] between thighs, shanks and paws of two legs, at most `bound` (>= 0) [m].
 
-    The legs' bounding boxes are compared first; only if these are close, all 25 pairs of links are.
+    Bounding boxes are compared first, those of the legs, of a link and a leg, of two links: most pairs are far apart.
     """
-    gap = wp.max(wp.max(neighbour.low - leg.high, leg.low - neighbour.high), vec3(real(0.0)))
     reach = bound + leg.geometry.paw_radius + neighbour.geometry.paw_radius
+    reach_sq = reach * reach
     nearest = bound
-    if wp.dot(gap, gap) < reach * reach:
-        count = wp.int32(25)
-        for pair in range(count):
-            k = pair // 5
-            m = pair % 5
-            radius = capsule_radius(leg, k) + capsule_radius(neighbour, m)
-            distance_sq = segment_segment_sq(
-                leg.ends[k], leg.ends[capsule_end(k)], neighbour.ends[m], neighbour.ends[capsule_end(m)]
-            )
-            nearest = wp.min(nearest, inflated_distance(distance_sq, radius, bound))
+    if box_gap_sq(leg.low, leg.high, neighbour.low, neighbour.high) < reach_sq:
+        for k in range(rolled(5)):
+            start, end = leg.ends[k], leg.ends[capsule_end(k)]
+            low, high = wp.min(start, end), wp.max(start, end)
+            if box_gap_sq(low, high, neighbour.low, neighbour.high) < reach_sq:
+                for m in range(rolled(5)):
+                    other_start, other_end = neighbour.ends[m], neighbour.ends[capsule_end(m)]
+                    if box_gap_sq(low, high, wp.min(other_start, other_end), wp.max(other_start, other_end)) < reach_sq:
+                        radius = capsule_radius(leg, k) + capsule_radius(neighbour, m)
+                        distance_sq = segment_segment_sq(start, end, other_start, other_end)
+                        nearest = wp.min(nearest, inflated_distance(distance_sq, radius, bound))
     return nearest
 
 
@@ -224,15 +244,24 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
     knee = real(FAR)
     shank = real(FAR)
     ankle_world = pos + rotation * capsules.ends[4]
-    for k in range(2):
-        axis_world = pos + rotation * capsules.ends[k]
+    for i in range(rolled(12)):
+        k = i // 6
+        part = i % 6  # of the link: axis, middle of the thigh, knee, three points of the shank
         knee_world = pos + rotation * capsules.ends[k + 2]
-        thigh = wp.min(thigh, ground_distance(ground, axis_world))
-        thigh = wp.min(thigh, ground_distance(ground, real(0.5) * (axis_world + knee_world)))
-        knee = wp.min(knee, ground_distance(ground, knee_world))
-        for i in range(3):
-            fraction = SHANK_FREE * real(i + 1) / real(3.0)
-            shank = wp.min(shank, ground_distance(ground, knee_world + fraction * (ankle_world - knee_world)))
+        point = knee_world
+        if part < 2:
+            point = pos + rotation * capsules.ends[k]
+        if part == 1:
+            point = real(0.5) * (point + knee_world)
+        if part > 2:
+            point = knee_world + SHANK_FREE * real(part - 2) / real(3.0) * (ankle_world - knee_world)
+        distance = ground_distance(ground, point)
+        if part < 2:
+            thigh = wp.min(thigh, distance)
+        elif part == 2:
+            knee = wp.min(knee, distance)
+        else:
+            shank = wp.min(shank, distance)
     shank = wp.min(shank, knee)
     return vec4(
         housing - geo.housing_radius, thigh - geo.thigh_radius, knee - geo.thigh_radius, shank - geo.shank_radius

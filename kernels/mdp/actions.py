@@ -91,4 +91,6 @@ def action_kernel(
         delays.target_history[step_count % RING, m, world] = safe[j]
         select_delayed_target(delays, step_count, world, m)
     if leg == 0:
+        if world == episode.first:
+            episode.num_listed[episode.slice] = 0
         begin_policy_step(arrays, push, skill.push_in_flight, world)

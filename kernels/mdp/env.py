@@ -42,6 +42,9 @@ class EpisodeArrays:
     purpose: int  # index in `jumper_warp.utils.streams.PURPOSES`
     first: int  # world of the first thread of a launch
     slice: int  # index of the launch's slice of worlds
+    listed_only: int  # 1: a launch's threads take the worlds of `listed`, see `launched_world`
+    listed: wp.array(dtype=int)  # from `first` on: worlds whose episode ended, or whose command is due, in this step
+    num_listed: wp.array(dtype=int)  # by slice, the number of its worlds in `listed`
     step_count: wp.array(dtype=int)  # policy steps made; with seed and purpose, the whole state of the random streams
     skill: wp.array(dtype=int)  # index of a world's active task
     requested_task: wp.array(dtype=int)  # index of the requested task (`Env.request`), -1: none
@@ -58,6 +61,19 @@ class EpisodeArrays:
     bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world counts as diverged at the end of the step
     level: wp.array(dtype=int)  # curriculum level; num_levels: all were passed
     streak: wp.array(dtype=int)  # consecutive successes
+
+
+@wp.func
+def launched_world(episode: EpisodeArrays, index: int) -> int:
+    """Return the world of a launch's thread `index`, or -1 if it has none.
+
+    With `listed_only` few worlds are left, which the first threads take, so that no block starts late.
+    """
+    if episode.listed_only == 0:
+        return episode.first + index
+    if index < episode.num_listed[episode.slice]:
+        return episode.listed[episode.first + index]
+    return -1
 
 
 @wp.struct

@@ -14,7 +14,7 @@ from ..kinematics.inverse import LegLimits
 from ..layout import BODIES, COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
-from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
+from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings, launched_world
 from .options import FAST, kernel_name
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import update_paw_kinematics
@@ -66,9 +66,9 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         Worlds of `skill` only; mask: (num_worlds,). All lanes of a world (one warp) run the task's reset, which splits
         its work by `rng.lane`; lane 0 writes the state. A world that passed the last level uses a sampled one.
         """
-        world, lane = wp.tid()
-        world += episode.first
-        if episode.skill[world] != skill:
+        index, lane = wp.tid()
+        world = launched_world(episode, index)
+        if world < 0 or episode.skill[world] != skill:
             return
         begins = mask[world] != 0.0
         commanded = bool(False)

@@ -79,7 +79,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     (advance,), endings, rewards = (task.params.slots[name] for name in ("advance", "terminations", "rewards"))
     (curriculum,) = task.params.slots["curriculum"]
     diverged_ending = [slot.func for slot in endings].index(terminations.diverged)
-    floor = task.reward_floor
+    floor, due = task.reward_floor, task.command.resample_due
 
     def step_kernel(
         # in
@@ -159,6 +159,13 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
         write_step_result(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
+        listed = ended
+        if wp.static(due is not None):
+            listed = ended or wp.static(due)(state)
+        if listed:
+            place = episode.first + wp.atomic_add(episode.num_listed, episode.slice, 1)
+            if place < episode.listed.shape[0]:  # a stage that is timed alone lists its worlds again
+                episode.listed[place] = world
         if ended:
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):

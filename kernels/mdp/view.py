@@ -28,14 +28,14 @@ class RobotView:
     quat: wp.quat  # [1] orientation of the base (xyzw), body to world
     lin_vel: wp.vec3  # [m/s] velocity of the base origin, world
     prev_lin_vel: wp.vec3  # [m/s] `lin_vel` of the previous policy step, world
-    lin_acc: wp.vec3  # [m/s^2] acceleration of the base origin, mean of the policy step, world
+    lin_acc: wp.vec3  # [m/s^2] acceleration of the base origin, mean over the policy step, world
     ang_vel: wp.vec3  # [rad/s] angular velocity of the base, body axes
     projected_gravity: wp.vec3  # [1] direction of gravity, body axes
     gravity_magnitude: float  # [m/s^2] downward acceleration of gravity
     angle: vec12  # [rad] motor angles
     sensed_angle: vec12  # [rad] motor angles with the errors of the position sensors
     rate: vec12  # [rad/s] motor speeds: time derivatives of `angle`
-    joint_acc: vec12  # [rad/s^2] motor accelerations, mean of the policy step
+    joint_acc: vec12  # [rad/s^2] motor accelerations, mean over the policy step
     torque: vec12  # [N m] motor torques of the last physics step
     prev_torque: vec12  # [N m] motor torques of the last physics step in the previous policy step
     action: vec12  # [1] action of the policy, within -1..1
@@ -47,7 +47,7 @@ class RobotView:
     collisions: int  # bits of all collisions
     contact: wp.vec4  # [1] 1 for a paw on the ground, else 0
     first_contact: wp.vec4  # [1] 1 for a paw that touched down in this step, else 0
-    air_time: wp.vec4  # [s] time since each paw left the ground; at touchdown the whole swing, later 0
+    air_time: wp.vec4  # [s] time since each paw left the ground; in the step of a touchdown the whole swing, later 0
     contact_time: wp.vec4  # [s] time since each paw touched down; 0 in the air
     touchdown_speed: wp.vec4  # [m/s] downward speed of each paw one policy step before its last touchdown
     paw_force: wp.vec4  # [N] size of the contact force on each paw in the last physics step

@@ -12,7 +12,7 @@ from jumper_warp.utils.assets import POLICIES
 NAMES = sorted(path.parent.name for path in POLICIES.glob("*/manifest.json"))
 ERROR_KEYS = {  # by policy
     "vertical_jump": "in_range_apex_error_abs_mean_m", "horizontal_jump": "in_range_goal_distance_at_rest_mean_m",
-    "walking_rough": "settled_rmse_vx_m_s", "attitude": "error_at_end_mean_deg",
+    "walking": "settled_rmse_vx_m_s", "attitude": "error_at_end_mean_deg",
 }  # fmt: skip
 
 
@@ -36,7 +36,7 @@ def test_listed_values_are_those_of_metrics_json(capsys):
         assert policies[name]["error"] == nominal_metrics(name)[key]
     settled = nominal_metrics("attitude")["settled_without_collision_rate"]["value"]
     assert policies["attitude"]["success_rate"] == settled
-    assert policies["walking_rough"]["success_rate"] == 1.0 - nominal_metrics("walking_rough")["fall_rate"]["value"]
+    assert policies["walking"]["success_rate"] == 1.0 - nominal_metrics("walking")["fall_rate"]["value"]
     assert tasks["horizontal-jump-mars-loose"]["policies"] == ["mars_horizontal_jump", "mars_springs_jump"]
     assert tasks["velocity-flat"]["aliases"] == ["Olympus-Walk"]
 

@@ -13,7 +13,7 @@ from jumper_warp.deploy.runtime import Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.policies.policy import load_policy
 
-POLICIES = ("vertical_jump", "horizontal_jump", "walking_flat")
+POLICIES = ("vertical_jump", "horizontal_jump", "walking")
 
 
 @pytest.fixture(scope="session")

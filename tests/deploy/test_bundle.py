@@ -45,10 +45,10 @@ MISTAKES = {  # by name: the policy that is checked, and a function that changes
     "swapped defaults": ("vertical_jump", lambda policy, bundle: swap(action_of(policy)["offset"], 0, 1)),
     "wrong sign": ("vertical_jump", lambda policy, bundle: bundle["joint_signs"].__setitem__(4, -1)),
     "degrees": (
-        "walking_flat",
+        "walking",
         lambda policy, bundle: action_of(policy).update(scale=np.degrees(action_of(policy)["scale"]).tolist()),
     ),
-    "wrong gain": ("walking_flat", lambda policy, bundle: policy["stiffness"].__setitem__(3, 34.0)),
+    "wrong gain": ("walking", lambda policy, bundle: policy["stiffness"].__setitem__(3, 34.0)),
     "wrong scale": ("horizontal_jump", lambda policy, bundle: policy["observations"]["rate"].update(scale=0.05)),
 }
 
@@ -113,7 +113,7 @@ def test_stale_history_fails_the_check(bundle_folder, monkeypatch):
 
 def test_swapped_onnx_file_is_refused(bundle_folder, tmp_path):
     folder = shutil.copytree(bundle_folder, tmp_path / "bundle")
-    shutil.copy(folder / "walking_flat.onnx", folder / "vertical_jump.onnx")
+    shutil.copy(folder / "walking.onnx", folder / "vertical_jump.onnx")
     with pytest.raises(InputError, match="differs from its hash"):
         Bundle(folder)
 

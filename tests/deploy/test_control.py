@@ -16,7 +16,7 @@ from jumper_warp.sim.simulation import Simulation, motor_values
 SETTINGS = {
     "vertical_jump": (jumping_motors(18.0, lateral_torque=10.0), vertical_jump_filter()),
     "horizontal_jump": (jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter()),
-    "walking_flat": (walking_motors(), walking_filter()),
+    "walking": (walking_motors(), walking_filter()),
 }
 WORLDS, STEPS = 50, 72  # 3,600 recorded steps of each policy, 10,800 of all
 

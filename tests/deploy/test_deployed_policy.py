@@ -221,9 +221,9 @@ def test_jump_command_refuses_implausible_values(speed, values):  # vertical vel
 
 
 def test_exported_file_has_its_checksum_and_the_weights_of_the_policy(tmp_path):
-    path = export_onnx(load_policy("walking_flat"), tmp_path / "walk.onnx")
+    path = export_onnx(load_policy("walking"), tmp_path / "walk.onnx")
     onnx.checker.check_model(onnx.load(path), full_check=True)
-    exported, shipped = DeployedPolicy(path), onnx_of("walking_flat")
+    exported, shipped = DeployedPolicy(path), onnx_of("walking")
     readings = zero_readings(shipped)
     np.testing.assert_array_equal(exported.targets(readings), shipped.targets(readings))
     assert exported.interface == shipped.interface

@@ -9,7 +9,6 @@ import pytest
 import warp as wp
 
 from columns import X
-from jumper_warp.diff.bodies import body_gradients, moment_rows
 from jumper_warp.diff.rollout import GEOMETRY_NAMES, Rollout
 from jumper_warp.kernels import layout
 from jumper_warp.robot.model import build_model
@@ -154,35 +153,6 @@ def test_gradients_of_a_hung_robot_match_differences():
             of.hold(False)
     assert (held[:, :7] == held[0, :7]).all() and np.ptp(held[:, 8]) > 0.5  # [rad] FL_outer
     np.testing.assert_allclose(gradient_by["kp"][[1, 8]], expected, rtol=1.0e-6)
-
-
-def test_gradients_by_bodies_match_differences_of_their_moments():
-    """Gradients by mass, com and inertia about the com of a shank follow from moments by the parallel axis theorem."""
-    rng = np.random.default_rng(2)
-    gradient = rng.normal(size=(GRAVITY + 3, 1))
-    table = rollout().parameters["table"].numpy()[:, :1].astype(float)
-    body = 5  # inner shank of FL
-
-    def moments(mass, c, inertia):  # (10,) rows of the parameter table
-        full = np.array([[inertia[0], inertia[3], inertia[4]], [inertia[3], inertia[1], inertia[5]],
-                         [inertia[4], inertia[5], inertia[2]]])  # fmt: skip
-        second = 0.5 * np.trace(full) * np.eye(3) - full + mass * np.outer(c, c)
-        return np.array([mass, *(mass * c), *second.diagonal(), second[0, 1], second[0, 2], second[1, 2]])
-
-    mass, c, inertia = 0.3, np.array([0.01, -0.02, -0.1]), np.array([3.0, 4.0, 2.0, 0.1, -0.2, 0.3]) * 1.0e-3
-    table[moment_rows(body), 0] = moments(mass, c, inertia)
-    gradient_by = body_gradients(table, gradient)
-    by_rows = gradient[moment_rows(body), 0]
-    by_mass = (moments(mass + 1.0e-6, c, inertia) - moments(mass - 1.0e-6, c, inertia)) @ by_rows / 2.0e-6
-    assert gradient_by["mass"][body, 0] == pytest.approx(by_mass, rel=1.0e-7)
-    for i in range(3):
-        d = 1.0e-6 * np.eye(3)[i]
-        by_com = (moments(mass, c + d, inertia) - moments(mass, c - d, inertia)) @ by_rows / 2.0e-6
-        assert gradient_by["com"][body, i, 0] == pytest.approx(by_com, rel=1.0e-7)
-    for i in range(6):
-        d = 1.0e-6 * np.eye(6)[i]
-        by_inertia = (moments(mass, c, inertia + d) - moments(mass, c, inertia - d)) @ by_rows / 2.0e-6
-        assert gradient_by["inertia"][body, i, 0] == pytest.approx(by_inertia, rel=1.0e-7)
 
 
 def test_single_precision_gradients_match_double_precision():

@@ -21,7 +21,7 @@ from jumper_warp.utils.errors import InputError
 POLICIES = {
     "vertical-jump": "vertical_jump",
     "horizontal-jump": "horizontal_jump",
-    "velocity-flat": "walking_flat",
+    "velocity-rough": "walking",
     "attitude": "attitude",
 }
 
@@ -162,7 +162,7 @@ def test_returns_of_flights_match_differences_with_the_policy_in_the_loop():
     assert 0.97 < ratio.median() < 1.03
 
 
-@pytest.mark.parametrize("name", ["vertical-jump", "velocity-flat"])
+@pytest.mark.parametrize("name", ["vertical-jump", "velocity-rough"])
 def test_gradients_of_observations_match_differences(name):
     """With history (vertical-jump) and latency of sensors (velocity-flat), three policy steps after an action."""
     env = Env(make_task(name), 24, seed=1, device="cpu")

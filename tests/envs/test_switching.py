@@ -132,9 +132,9 @@ def test_skills_have_the_robot_of_their_training_unless_it_differs(tmp_path, cap
     assert mass_of(8.0, 8.0, 8.0) == pytest.approx(8.0)
     assert "overlay" not in capfd.readouterr().err
     assert mass_of(None, 8.0, None) == pytest.approx(8.0)
-    line = "jumper: the robot has the overlay of vertical_jump; walking_flat and horizontal_jump were trained without"
+    line = "jumper: the robot has the overlay of vertical_jump; walking and horizontal_jump were trained without"
     assert line in capfd.readouterr().err.splitlines()
-    with pytest.raises(PolicyError, match=r"walking_flat and horizontal_jump .* different robots.* --robot FILE"):
+    with pytest.raises(PolicyError, match=r"walking and horizontal_jump .* different robots.* --robot FILE"):
         mass_of(8.0, None, 7.0)
     RobotOverlay({"base_mass": (9.0,)}).save(tmp_path / "robot.json")
     assert mass_of(8.0, None, 7.0, robot=tmp_path / "robot.json") == pytest.approx(9.0)

@@ -165,7 +165,7 @@ def test_walks_agree_with_recomputed_ones(tmp_path):
     commands = np.concatenate([rng.uniform(-2.2, 2.2, (32, 2, 3)), np.zeros((8, 2, 3))])
     slew = np.repeat([np.inf, 1.25, np.inf], [16, 16, 8])
     log, rec = record(
-        "walking_flat", lambda task: VelocityLog(commands, task, 6.0, times=np.array([0.0, 3.0]), slew=slew), tmp_path
+        "walking", lambda task: VelocityLog(commands, task, 6.0, times=np.array([0.0, 3.0]), slew=slew), tmp_path
     )
     steps = len(rec.rows) - 1
     turn = [Rotation.from_quat(quat) for quat in rec.quat]

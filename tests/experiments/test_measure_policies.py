@@ -37,11 +37,11 @@ def test_payload_keeps_springs_and_moves_the_mass_towards_the_centre_of_the_base
 
 
 def test_condition_is_undefined_only_where_its_change_does_nothing():
-    tasks = {name: EvaluationRun(name).task for name in ("vertical_jump", "walking_flat", "attitude")}
+    tasks = {name: EvaluationRun(name).task for name in ("vertical_jump", "walking", "attitude")}
     reasons = {name: [key for key in CONDITIONS if undefined(task, key)] for name, task in tasks.items()}
     assert reasons == {
         "vertical_jump": [],
-        "walking_flat": ["push_in_flight"],
+        "walking": ["push_in_flight"],
         "attitude": ["friction_0.4", "push_in_flight"],
     }
 

@@ -1,6 +1,6 @@
 """Compare gradients of returns, through rewards and physics with contact, with differences in double precision.
 
-    python -m tests.helpers.reward_gradients vertical_jump horizontal_jump walking_flat attitude
+    python -m tests.helpers.reward_gradients vertical_jump horizontal_jump walking attitude
 
 Robots start a window of policy steps anywhere in episodes of their policy. The gradient of the window's return by all
 actions is compared with central differences along random directions, of a simulation in double precision: the cosine

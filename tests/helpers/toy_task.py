@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 
-from jumper_warp.rl import seeds
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.rl.torch.ppo import Ppo
@@ -166,5 +165,5 @@ def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
 def train_seeds_rank(rank: int, port: int, cfg: TrainCfg) -> None:
     """Train the seeds of one of two processes."""
     join(rank, port)
-    seeds.train(cfg, PushTask)
+    train(cfg, PushTask)
     assert not torch.distributed.is_initialized()

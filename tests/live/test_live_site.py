@@ -10,7 +10,7 @@ from jumper_warp.policies.policy import Policy
 
 
 def test_exported_policy_has_all_weights_and_the_interface(tmp_path):
-    main(["export", "walking_rough", "--out", str(tmp_path / "mine")])
+    main(["export", "walking", "--out", str(tmp_path / "mine")])
     description = json.loads((tmp_path / "mine" / "policy.json").read_text())
     values = np.fromfile(tmp_path / "mine" / "policy.bin", dtype="<f4")
     policy = Policy.load(tmp_path / "mine")  # its manifest covers the new files
@@ -31,7 +31,7 @@ def test_own_policies_take_the_place_of_their_skills(tmp_path, monkeypatch):
     (bundle / "index.html").write_text("page")
     monkeypatch.setattr(site, "files", lambda name: tmp_path / "live")
     monkeypatch.setattr(site, "SCENES", {"plain": site.EARTH})
-    site.write_page(tmp_path / "out", [Policy.load("walking_rough")])
+    site.write_page(tmp_path / "out", [Policy.load("walking")])
     scenes = json.loads((tmp_path / "out" / "scenes.json").read_text())
     assert scenes == {"plain": site.EARTH | {"walk": "my_walk"}}
     description = json.loads((tmp_path / "out" / "policies" / "my_walk" / "policy.json").read_text())

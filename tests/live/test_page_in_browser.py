@@ -137,12 +137,12 @@ DROP = """async (folder) => {
 
 
 def test_dropped_policy_runs_and_a_damaged_one_is_one_line(visitor, tmp_path):
-    visitor.evaluate(DROP, "policies/walking_rough")
-    visitor.wait_for_function("document.getElementById('names').textContent.includes('walking_rough')")
+    visitor.evaluate(DROP, "policies/walking")
+    visitor.wait_for_function("document.getElementById('names').textContent.includes('walking')")
     visitor.wait_for_function("page.state && !page.state.fallen")
     policy = tmp_path / "mine"
     policy.mkdir()
-    for file, content in browser_files(Policy.load("walking_flat"), "mine").items():
+    for file, content in browser_files(Policy.load("walking"), "mine").items():
         (policy / file).write_bytes(content)
     visitor.locator("#files").set_input_files(policy)
     visitor.wait_for_function("document.getElementById('names').textContent.includes('mine')")

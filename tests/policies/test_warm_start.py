@@ -20,7 +20,7 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a sym
         ("horizontal_jump", "horizontal-jump-mars", {}),
         ("horizontal_jump", "horizontal-jump-mars", WIDE),
         ("vertical_jump", "vertical-jump-mars", WIDE),
-        ("walking_flat", "velocity-flat", WIDE),
+        ("walking", "velocity-rough", WIDE),
     ],
 )
 def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):

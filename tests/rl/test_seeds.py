@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from jumper_warp.policies.catalog import newest_run
-from jumper_warp.rl import seeds
 from jumper_warp.rl.checkpoint import MANIFEST, load_checkpoint
 from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.metrics_file import METRICS_FILE
@@ -39,7 +38,7 @@ def state(folder, iteration=4):
 
 
 def test_every_seed_has_bitwise_the_results_of_a_single_training(cfg, tmp_path):
-    result = seeds.train(cfg, SeededTask)
+    result = train(cfg, SeededTask)
     folders = seed_folders(result.folder)
     assert list(folders) == [1, 4, 7] and result.iteration == 4
     for seed, folder in folders.items():
@@ -54,9 +53,9 @@ def test_every_seed_has_bitwise_the_results_of_a_single_training(cfg, tmp_path):
 
 
 def test_resume_continues_all_seeds_bitwise(cfg):
-    whole = seeds.train(cfg, SeededTask)
-    half = seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask)
-    again = seeds.train(dataclasses.replace(cfg, resume=str(half.folder)), SeededTask)
+    whole = train(cfg, SeededTask)
+    half = train(dataclasses.replace(cfg, max_iterations=2), SeededTask)
+    again = train(dataclasses.replace(cfg, resume=str(half.folder)), SeededTask)
     assert again.folder == half.folder
     for seed, folder in seed_folders(whole.folder).items():
         ours, theirs = state(folder), state(again.folder / f"seed_{seed}")
@@ -68,7 +67,7 @@ def test_two_processes_share_the_seeds_without_changing_their_results(cfg, tmp_p
     shared = dataclasses.replace(cfg, log_root=tmp_path / "shared", threads=1)
     torch.multiprocessing.spawn(train_seeds_rank, (free_port(), shared), nprocs=2)
     (run,) = shared.log_root.glob("push/*")
-    alone = seeds.train(dataclasses.replace(cfg, threads=1), PushTask)
+    alone = train(dataclasses.replace(cfg, threads=1), PushTask)
     assert list(seed_folders(run)) == [1, 4, 7]
     for seed, folder in seed_folders(run).items():
         assert equal(state(folder)["ppo"], state(alone.folder / f"seed_{seed}")["ppo"])
@@ -77,7 +76,7 @@ def test_two_processes_share_the_seeds_without_changing_their_results(cfg, tmp_p
 
 
 def test_resume_takes_the_last_iteration_that_all_seeds_have(cfg):
-    folder = seeds.train(cfg, SeededTask).folder
+    folder = train(cfg, SeededTask).folder
     path = folder / "seed_4" / CHECKPOINTS / MANIFEST
     manifest = json.loads(path.read_text())
     del manifest["iteration_000004.pt"]  # as if the process was killed while it saved
@@ -85,7 +84,7 @@ def test_resume_takes_the_last_iteration_that_all_seeds_have(cfg):
     found = find_checkpoints(dataclasses.replace(cfg, resume="latest"))
     assert [checkpoint.state["iteration"] for checkpoint in found] == [2, 2, 2]
     before = state(folder / "seed_7")
-    seeds.train(dataclasses.replace(cfg, resume="latest"), SeededTask)
+    train(dataclasses.replace(cfg, resume="latest"), SeededTask)
     after = state(folder / "seed_7")
     assert equal(before["ppo"], after["ppo"])
 
@@ -106,25 +105,25 @@ def spoil(monkeypatch, spoiled, at):
 
 def test_a_seed_that_diverges_is_frozen_and_the_others_continue(cfg, monkeypatch, capsys):
     spoil(monkeypatch, {1}, at=3)
-    result = seeds.train(cfg, SeededTask)
+    result = train(cfg, SeededTask)
     iterations = {seed: each.iteration for seed, each in result.seeds.items()}
     assert iterations == {7: 4, 1: 4, 4: 4}
     assert "seed 1: frozen at iteration 4: the weights are not finite" in capsys.readouterr().err
     assert (result.folder / "seed_1" / FROZEN).read_text().startswith("iteration 4")
     assert not (result.folder / "seed_1" / CHECKPOINTS / "iteration_000004.pt").exists()
     longer = dataclasses.replace(cfg, max_iterations=6, resume=str(result.folder))
-    assert {seed: each.iteration for seed, each in seeds.train(longer, SeededTask).seeds.items()} == {7: 6, 4: 6}
+    assert {seed: each.iteration for seed, each in train(longer, SeededTask).seeds.items()} == {7: 6, 4: 6}
 
 
 @pytest.mark.parametrize("single", [True, False])
 def test_a_training_fails_if_all_its_seeds_diverge(cfg, monkeypatch, single):
     spoil(monkeypatch, {0, 1, 2}, at=1)
     with pytest.raises(SystemExit, match="weights are not finite"):
-        train(dataclasses.replace(cfg, seeds=()), SeededTask) if single else seeds.train(cfg, SeededTask)
+        train(dataclasses.replace(cfg, seeds=()) if single else cfg, SeededTask)
 
 
 def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
-    result = seeds.train(cfg, SeededTask)
+    result = train(cfg, SeededTask)
     folders = seed_folders(result.folder)
     for seed, folder in folders.items():
         assert newest_run(f"{result.folder}:{seed}") == folder
@@ -141,6 +140,6 @@ def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
 
 
 def test_resume_refuses_other_seeds(cfg):
-    folder = str(seeds.train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder)
+    folder = str(train(dataclasses.replace(cfg, max_iterations=2), SeededTask).folder)
     with pytest.raises(InputError, match="has seeds 1, 4, 7, got seeds 1, 2"):
-        seeds.train(dataclasses.replace(cfg, seeds=(1, 2), resume=folder), SeededTask)
+        train(dataclasses.replace(cfg, seeds=(1, 2), resume=folder), SeededTask)

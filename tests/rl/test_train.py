@@ -3,6 +3,7 @@ import json
 import math
 import os
 import signal
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.logger import Scores
+from jumper_warp.rl.logger import Scores, TrainingConsole
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.rsl_rl import rsl_rl_config
@@ -195,7 +196,8 @@ def resumed_state(cfg, folder, **ppo):
     cfg = dataclasses.replace(cfg, resume=str(folder), ppo=dataclasses.replace(cfg.ppo, **ppo))
     (checkpoint,) = find_checkpoints(cfg)
     env = make_env(cfg.num_envs, 1, "cpu")
-    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")), checkpoint=checkpoint)
+    rank, console = Rank(0, 1, torch.device("cpu")), TrainingConsole(cfg)
+    run = TrainingRun(cfg, env, rank, console, nullcontext(), checkpoint=checkpoint)
     return run.ppo, run.notes
 
 

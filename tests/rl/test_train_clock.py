@@ -2,12 +2,14 @@
 
 import dataclasses
 import time
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.logger import TrainingConsole
 from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.runner import CHECKPOINTS, iterate, train
 from jumper_warp.rl.training_run import TrainingRun
@@ -65,8 +67,9 @@ def resume_clocked(monkeypatch, cfg, seconds, limit):
     env = ClockedTask(cfg.num_envs, durations=[1.0 / 128.0] * 160)
     monkeypatch.setattr(time, "perf_counter", lambda: env.now)
     cfg = dataclasses.replace(cfg, max_seconds=limit, resume=str(half.folder))
-    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")), checkpoint=find_checkpoints(cfg)[0])
-    iterate([run])
+    console, (checkpoint,) = TrainingConsole(cfg), find_checkpoints(cfg)
+    run = TrainingRun(cfg, env, Rank(0, 1, torch.device("cpu")), console, nullcontext(), checkpoint=checkpoint)
+    iterate([run], console)
     return run, run.result()
 
 

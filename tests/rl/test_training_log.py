@@ -5,7 +5,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.logger import TrainingLog
+from jumper_warp.rl.logger import TrainingConsole, TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, push_cfg
@@ -35,7 +35,7 @@ def event_steps(folder):
 
 def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     terms = {"Episode_Reward/tilt": float("nan"), "hop/Episode_Reward/fall": float("inf")}
-    with TrainingLog(tmp_path, {}, LOGGED) as log:
+    with TrainingLog(tmp_path, {}, LOGGED, TrainingConsole(LOGGED)) as log:
         log.log(1, METRICS | {"Episode_Reward/tilt": 0.5}, remaining=5.0)
         for iteration in (2, 3):
             log.log(iteration, METRICS | terms | {"Loss/value": 1.0}, remaining=5.0)

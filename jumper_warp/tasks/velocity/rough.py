@@ -16,11 +16,13 @@ from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.robot.terrain import KINDS, TerrainCfg
 from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
+from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
 from jumper_warp.tasks.velocity.cfg import CommandCfg
-from jumper_warp.tasks.velocity.flat import ACTOR, velocity_flat
+from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
+ACTOR = remembered(WITHOUT_HISTORY, 8)  # Policy observation: over eight policy steps, or 0.13 s
 REACH = (1.1, 1.1, 0.75, 1.1)
 COMMANDS = CommandCfg(REACH, REACH, levels=0, standing_probability=0.15, resampling_time_range=(1.5, 5.0))
 """Velocity commands on the terrain map, at one level."""
@@ -36,20 +38,22 @@ STEPS_UP = (
 def velocity_rough() -> TaskCfg:
     """Return the task of velocity tracking on a terrain map of level ground, slopes and steps (`GROUNDS`)."""
     flat = velocity_flat()
-    settings = replace(flat.reset.settings, terrain=TerrainCfg(kinds=GROUNDS, slope=12.0), tolerance=0.25)
+    terrain = TerrainCfg(kinds=GROUNDS, step=(0.02, 0.08), slope=12.0)
+    settings = replace(flat.reset.settings, terrain=terrain, tolerance=0.25)
     task = replace(
         flat,
         name="velocity-rough",
         reset=replace(flat.reset, settings=settings),
         levels=(COMMANDS,),
         observations=ObservationsCfg(
-            actor=ACTOR, critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights))
+            actor=ACTOR,
+            critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights)),
         ),
     )
     task = task.with_terms(
         "rewards",
         linear_velocity_fine={"weight": 3.0},
-        yaw_rate_fine={"weight": 8.0},
+        yaw_rate_fine={"weight": 6.0},
         lin_vel_z_l2={"weight": -0.5},
         flat_orientation_l2={"weight": -10.0},
         air_time={"weight": 5.0},

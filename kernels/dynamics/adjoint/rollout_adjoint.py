@@ -38,8 +38,7 @@ from ..trajectory import (
 from . import command_adjoint
 from .command_adjoint import FilterAdjoint, MotorAdjoint
 from .gradients import GRADIENT_ROWS, Gradients, NoSums, add_com, add_filter
-from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
-from .step_adjoint import reverse_step
+from .step_adjoint import LegReverse, ReplayedStep, StepRecord, replay_step, reverse_step
 from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
