@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
@@ -52,7 +54,7 @@ class FixedRollout(Rollout):
         self._motion = [self._actuation, commands, filtered_target, rows]
         self._reverse = cotangents, gradients
         self._record = self.dynamics.step_record(self.every)
-        self._recorded: dict[Kernel, list[wp.Launch]] = {}
+        self._recorded: dict[Kernel, list[Any]] = {}  # `wp.Launch`, one a slice of worlds
         self._timed = self._timing(most)
         self._legs = LegThreadReverse(self.dynamics, self.every) if self.by_legs else None
 

@@ -53,6 +53,7 @@ class KernelModules:
             leg_adjoint,
             rollout_adjoint,
             rollout_legs_adjoint,
+            rollout_targets,
             step_adjoint,
         )  # fmt: skip
         from jumper_warp.kernels.dynamics.legs import advance_legs, rollout_legs

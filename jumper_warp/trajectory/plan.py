@@ -8,7 +8,7 @@ depend on takeoff and touchdown of the simulated motion, which have no gradient.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -142,8 +142,8 @@ class PlanModel:
         self._launch(self._reverse_cost, rows)
         return np.nan_to_num(self.rollout.reverse() * self.scale, nan=0.0, posinf=0.0, neginf=0.0)
 
-    def _launch(self, launch: wp.Launch, rows: int) -> None:
-        """Launch a recorded kernel of the cost over some rows."""
+    def _launch(self, launch: Any, rows: int) -> None:
+        """Launch a recorded kernel of the cost, a `wp.Launch`, over some rows."""
         launch.set_dim((rows, self.rollout.num_worlds, 4))
         with WARP_LOCK:
             launch.launch()
