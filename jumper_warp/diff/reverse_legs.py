@@ -57,7 +57,7 @@ class LegThreadReverse:
             """Launch a kernel over `dim` and the four legs, in blocks of whole warps."""
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
-        for end in range(rows.q.shape[0] - 1, 0, -SPAN):
+        for end in range(timing.steps * timing.substeps // timing.every, 0, -SPAN):
             span = legs.Span()
             span.begin, span.end = max(0, end - SPAN), end
             launch(legs.replay_legs_kernel, (end - span.begin, threads), num, robot, settings, *motion, span, record)

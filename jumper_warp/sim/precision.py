@@ -54,6 +54,7 @@ class KernelModules:
             multipliers,
             rollout_adjoint,
             rollout_legs_adjoint,
+            rollout_targets,
         )
         from jumper_warp.kernels.dynamics.legs import advance_legs, rollout_legs
         from jumper_warp.kernels.dynamics.world import advance, rollout

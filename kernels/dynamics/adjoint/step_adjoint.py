@@ -11,6 +11,8 @@ at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion h
 mode of the forward pass.
 """
 
+from typing import Any
+
 import warp as wp
 
 from ...layout import BASE, GRAVITY
@@ -37,9 +39,7 @@ class StepAdjoint:
 
 
 @wp.func
-def add_leg_gradient(
-    gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
-):
+def add_leg_gradient(gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: Any):
     """Add the gradient of leg k's virtual power w.r.t. its motors to `legs`, and w.r.t. its parameters to `sums`.
 
     Also writes the gradient w.r.t. the motors' torques to `legs`: dt times the multipliers, since torques enter the
@@ -58,7 +58,7 @@ def add_leg_gradient(
 def reverse_step(
     model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3),
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
-    legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+    legs: wp.array(dtype=LegReverse), sums: Any,
 ) -> StepAdjoint:  # fmt: skip
     """Backpropagate through one time step of a world: return the gradient w.r.t. the base's state at its start.
 
