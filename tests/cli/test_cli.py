@@ -55,6 +55,8 @@ def still(tmp_path_factory):
         (["play", "missing"], "no policy 'missing'"),
         (["evaluate", "velocity_rough"], "a task, not a policy; its policies: walking"),
         (["evaluate", "vertical_jump", "--height-range", "1.0", "0.5"], "height_range must be"),
+        (["evaluate", "vertical_jump", "--suite", "grid"], "no suite 'grid' for policies of"),
+        (["evaluate", "horizontal_jump", "--edge=0.3"], "--edge needs a test suite: add --suite platform"),
         (["evaluate", "vertical_jump", "--out", "\udcff"], "'\\udcff' is not UTF-8"),
         (["export", "vertical_jump", "--out", "x.pt"], "saved as a folder, whose name cannot end in .pt: got x.pt"),
         (["train", "vertical-jump", "--log-root", "", "--seed", "3"], "empty value after --log-root"),

@@ -3,27 +3,15 @@ import math
 import numpy as np
 import pytest
 
-from cli_helpers import run
 from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import write_trials
-from jumper_warp.policies.policy import save_policy
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS, with_jump_terminations
-from landing_helpers import still_policy
 from metric_helpers import values
 
 TASK = with_jump_terminations(make_task("horizontal-jump"))
-
-
-@pytest.fixture(scope="module")
-def policies(tmp_path_factory):
-    """Folder with a policy's folder for each of two tasks, by task name; the policies hold the default pose."""
-    folder = tmp_path_factory.mktemp("policies")
-    for name in ("vertical-jump", "horizontal-jump"):
-        save_policy(folder / name, still_policy(name))
-    return folder
 
 
 def test_jump_evaluations_check_success_after_failures():
@@ -53,19 +41,6 @@ def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
 def test_heading_flag_in_degrees_sets_all_headings():
     flags = LandingFlags(num_jumps=2, goal_x=(0.3, 0.4), heading=90.0)
     assert flags.log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
-
-
-@pytest.mark.parametrize(
-    ("task", "flags", "message"),
-    [
-        ("horizontal-jump", ["--height-range", "0.5", "1.0"], "Unrecognized options: --height-range"),
-        ("vertical-jump", ["--suite", "grid"], "no suite 'grid' for policies of vertical-jump; there are range"),
-        ("horizontal-jump", ["--edge=0.3"], "--edge needs a test suite: add --suite platform"),
-    ],
-)
-def test_refuses_flags_and_suites_of_other_tasks(policies, task, flags, message, capsys):
-    code, _, err = run(capsys, "evaluate", str(policies / task), *flags)
-    assert code == 2 and message in " ".join(err)
 
 
 def test_success_range_selects_goals_by_distance():
