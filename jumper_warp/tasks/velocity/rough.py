@@ -46,8 +46,7 @@ def velocity_rough() -> TaskCfg:
         reset=replace(flat.reset, settings=settings),
         levels=(COMMANDS,),
         observations=ObservationsCfg(
-            actor=ACTOR,
-            critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights)),
+            actor=ACTOR, critic=(*flat.observations.critic, ObservationTerm(velocity.ground_heights))
         ),
     )
     task = task.with_terms(
