@@ -3,18 +3,25 @@
     python experiments/rescue.py --out outputs/rescue
 
 A robot is lost if the policy makes the jump with the nominal robot and not with the changed one. Of the lost robots,
-the script counts those that the controller saves: after a long optimisation before the jump (offline), with two
-iterations in every policy step and the changed robot as the assumed one (known), or a robot that is identified from the
-lost jump (identified). It measures the time of a policy step too, and writes `metrics.json` and `rescue.png`.
+the script counts those that the controller saves: after long optimisations before the jump, from several first plans
+and with the simulation's own physics step (offline), with two iterations in every policy step and the changed robot as
+the assumed one (known), or a robot that is identified from the lost jump (identified). A robot that any of these saves
+is savable. The script also compares policy and controller on nominal robots, measures the time of a policy step, and
+writes `metrics.json`, the outcome of each robot (`outcomes.json`), `rescue.png` and, with `--film`, `rescue.webp`.
+Processes (`--processes`) share the robots, in batches of similar goals.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,13 +29,18 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.predictive_control import PredictiveController
-from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.log import SUCCESS, run_evaluation
+from jumper_warp.evaluation.predictive_control import SCALES, PredictiveController
+from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.utils.runtime import configure_device
+from jumper_warp.viz.film import write_film
+from jumper_warp.viz.pairs import side_by_side
 from jumper_warp.viz.plots import figure
+from jumper_warp.viz.recording import Recording
 from measure_policies import payload_overlay
 from support.own_motion import Record, RobotChange, identify, recorder_of, write_changes
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
@@ -53,6 +65,7 @@ CHANGES = {
     "mars": Change(gravity=MARS),
 }
 NOMINAL = {"nominal_places": Change(), "nominal_heights": Change(policy="vertical_jump", goals=(0.5, 1.08))}
+STARTS = (SCALES, (1.0,), (0.4,))  # Scales of the first plans that the mode offline tries in turn
 
 
 @dataclass(frozen=True)
@@ -61,13 +74,25 @@ class Args(ThreadArgs):
 
     changes: tuple[str, ...] = tuple(CHANGES)  # Names of the changes
     modes: tuple[str, ...] = ("offline", "known", "identified")  # Knowledge of the controller
-    count: int = 16  # Number of lost robots of each change
-    nominal: int = 16  # Number of nominal robots of each policy
-    candidates: int = 96  # Number of jumps from which lost ones are taken
+    count: int = 250  # Number of lost robots of each change
+    nominal: int = 400  # Number of nominal robots of each policy
+    candidates: int = 1500  # Number of jumps from which lost ones are taken
     iterations: int = 2  # Iterations in a policy step
-    offline_iterations: int = 150  # Iterations before the jump in the mode offline
+    substeps: int = 4  # Physics steps of a plan in a policy step, except in the mode offline
+    offline_iterations: int = 200  # Iterations before the jump in the mode offline
     timed: int = 3  # Number of jumps of a single robot whose steps are timed
-    seed: int = 0  # Seed of the goals
+    seed: int = 1  # Seed of the goals; the controller was tuned with seed 0
+    processes: int = 1  # Number of processes that share the robots
+    batch: int = 8  # Number of robots that a process simulates at once
+    film: bool = False  # Film a saved robot of each change beside the same robot with the policy
+
+
+class Rescue(NamedTuple):
+    """Outcome of a batch of jumps."""
+
+    ends: np.ndarray  # (robots,) names of the outcomes, see `JumpLog.outcomes`
+    found: RobotChange | None = None  # identified changes
+    recording: Recording | None = None  # of the first robot
 
 
 class Robots:
@@ -100,10 +125,13 @@ class Robots:
         places = np.stack([goals, 0.0 * goals], axis=1)[:, None]
         return JumpLog(goals if self.change.policy == "vertical_jump" else places, env.task.termination_names)
 
+    def goals(self, count: int) -> np.ndarray:
+        """Return random goals [m], (count,)."""
+        return np.random.default_rng(self.args.seed).uniform(*self.change.goals, count)
+
     def lost(self) -> tuple[np.ndarray, int]:
         """Return the goals [m] of at most `count` lost robots, and the number of all lost ones."""
-        rng = np.random.default_rng(self.args.seed)
-        goals = rng.uniform(*self.change.goals, self.args.candidates)
+        goals = self.goals(self.args.candidates)
         made = [
             self.run(self.env(len(goals), changed=changed), self.policy.act, goals).success[:, 0]
             for changed in (False, True)
@@ -111,11 +139,11 @@ class Robots:
         lost = goals[made[0] & ~made[1]]
         return lost[: self.args.count], len(lost)
 
-    def controller(self, env: Env, assumed: Env) -> PredictiveController:
-        """Return the controller of the robots of `env` with assumed ones."""
-        return PredictiveController(
-            env, self.policy, assumed, iterations=self.args.iterations, threads=self.args.threads
-        )
+    def controller(self, env: Env, assumed: Env, **options: Any) -> PredictiveController:
+        """Return the controller of the robots of `env` with assumed ones; options: of `PredictiveController`."""
+        args = self.args
+        options = {"iterations": args.iterations, "substeps": args.substeps, "threads": args.threads} | options
+        return PredictiveController(env, self.policy, assumed, **options)
 
     def record(self, goals: np.ndarray) -> Record:
         """Return the motion of the lost jumps to goals, with the policy."""
@@ -124,25 +152,86 @@ class Robots:
         self.run(env, act, goals)
         return record
 
-    def rescue(self, mode: str, goals: np.ndarray, folder: Path) -> tuple[np.ndarray, RobotChange | None]:
-        """Return which robots the controller saves, (len(goals),), and the identified change, if any."""
-        env = self.env(len(goals))
-        found = None
-        if mode == "identified":
-            assumed = self.env(len(goals), changed=False)
-            found = identify(self.record(goals), assumed)
-            write_changes(assumed, found)
-        else:
-            assumed = self.env(len(goals))
-        controller = self.controller(env, assumed)
+    def offline(self, goals: np.ndarray) -> np.ndarray:
+        """Return the outcomes of jumps after long optimisations before them, (len(goals),)."""
+        ends = np.full(len(goals), "", dtype=object)
+        for scales in STARTS:
+            rest = np.flatnonzero(ends != SUCCESS)
+            if len(rest):
+                env = self.env(len(rest))
+                controller = self.controller(
+                    env, self.env(len(rest)), scales=scales, iterations=1, substeps=SUBSTEPS
+                )  # fmt: skip
+                controller.first_iterations = self.args.offline_iterations
+                ends[rest] = self.run(env, controller.act, goals[rest]).outcomes[:, 0]
+        return ends
+
+    def rescue(self, mode: str, goals: np.ndarray, film: bool = False) -> Rescue:
+        """Return the outcome of jumps to goals [m] with the policy, or with the controller in one of `Args.modes`."""
         if mode == "offline":
-            controller.first_iterations = self.args.offline_iterations
+            return Rescue(self.offline(goals))
+        env = self.env(len(goals))
+        act = self.policy.act
+        found = None
+        if mode != "policy":
+            assumed = self.env(len(goals), changed=mode != "identified")
+            if mode == "identified":
+                found = identify(self.record(goals), assumed)
+                write_changes(assumed, found)
+            act = self.controller(env, assumed).act
         log = self.log(env, goals)
-        recorder = EnvRecorder(env, log, range(min(3, len(goals))), notes={"task": f"rescued, {mode}"})
-        run_evaluation(controller.act, env, log, on_begin=recorder.begin, on_step=recorder)
-        folder.mkdir(exist_ok=True)
-        save_recording(recorder.recording(), folder, mode)
-        return log.success[:, 0], found
+        recorder = EnvRecorder(env, log, range(1)) if film else None
+        calls = {} if recorder is None else {"on_begin": recorder.begin, "on_step": recorder}
+        run_evaluation(act, env, log, **calls)
+        return Rescue(log.outcomes[:, 0], found, recorder and recorder.recording())
+
+
+@dataclass(frozen=True)
+class Job:
+    """Jumps of a batch of robots, for one process."""
+
+    args: Args
+    name: str  # of the change
+    mode: str  # `policy`, or one of `Args.modes`
+    goals: np.ndarray  # [m]
+
+
+def start_process(args: Args) -> None:
+    """Prepare a process of the pool, which computes on one thread."""
+    torch.set_num_threads(1)
+    configure_device(args.device, 1)
+
+
+def run_job(job: Job) -> Rescue:
+    """Run a job in a process of the pool."""
+    return Robots((CHANGES | NOMINAL)[job.name], job.args).rescue(job.mode, job.goals)
+
+
+def run_jobs(args: Args, jobs: list[Job], folder: Path) -> dict[tuple[str, str], tuple[np.ndarray, list[RobotChange]]]:
+    """Return the successes and identified changes of all robots by name of the change and mode.
+
+    Writes the outcomes so far to `outcomes.json` in the folder after every batch.
+    """
+    results: dict[tuple[str, str], tuple[np.ndarray, list[RobotChange]]] = {}
+    rows: list[dict] = []
+    pool = None
+    if args.processes > 1:
+        pool = ProcessPoolExecutor(args.processes, get_context("spawn"), start_process, (args,))
+    for i, (ends, found, _) in enumerate((pool.map if pool else map)(run_job, jobs), 1):
+        job = jobs[i - 1]
+        key = job.name, job.mode
+        successes, changes = results.get(key, (np.zeros(0, dtype=bool), []))
+        results[key] = np.concatenate([successes, ends == SUCCESS]), changes + ([] if found is None else [found])
+        total = results[key][0]
+        rows += [
+            {"change": job.name, "mode": job.mode, "goal_m": goal, "outcome": end}
+            for goal, end in zip(job.goals.tolist(), ends.tolist(), strict=True)
+        ]
+        (folder / "outcomes.json").write_text(json.dumps(rows, indent=0))
+        announce(f"{i} of {len(jobs)}: {', '.join(key)}: {total.sum()} of {len(total)}")
+    if pool:
+        pool.shutdown()
+    return results
 
 
 def time_steps(args: Args) -> dict[str, float]:
@@ -173,42 +262,64 @@ def time_steps(args: Args) -> dict[str, float]:
     return values
 
 
+def make_jobs(args: Args, values: dict[str, float]) -> list[Job]:
+    """Return the jobs of all robots, and add the shares of lost robots to `values`."""
+    jobs = []
+    for name, modes in (dict.fromkeys(NOMINAL, ("policy", "known")) | dict.fromkeys(args.changes, args.modes)).items():
+        robots = Robots((CHANGES | NOMINAL)[name], args)
+        if name in NOMINAL:
+            goals = robots.goals(args.nominal)
+        else:
+            goals, lost = robots.lost()
+            values |= {f"{name}_lost_rate": lost / args.candidates, f"{name}_robots": float(len(goals))}
+            announce(f"{name}: {lost} of {args.candidates} lost")
+        batches = np.array_split(np.sort(goals), -(-len(goals) // args.batch)) if len(goals) else []
+        jobs += [Job(replace(args, threads=1), name, mode, batch) for mode in modes for batch in batches]
+    return jobs
+
+
+def film_rescues(args: Args, jobs: list[Job], results: dict, path: Path) -> None:
+    """Film a saved robot of each change, with the policy and with the controller that knows the change."""
+    recordings = {}
+    for name in args.changes:
+        goals = [job.goals for job in jobs if (job.name, job.mode) == (name, "known")]
+        saved = np.concatenate(goals)[results[name, "known"][0]] if goals else np.zeros(0)
+        for mode in ("policy", "known") if len(saved) else ():
+            rescue = Robots(CHANGES[name], args).rescue(mode, saved[[len(saved) // 2]], film=True)
+            recordings[f"{name.replace('_', ' ')}, {mode}"] = rescue.recording
+    write_film(side_by_side({label: each for label, each in recordings.items() if each}), path)
+
+
 def main(args: Args) -> dict:
     """Rescue the lost jumps of all changes, compare nominal jumps, time the controller, and return the metrics."""
     torch.set_num_threads(1)
     folder = prepare("rescue", args, args.threads)
     values: dict[str, float] = time_steps(args) if args.timed else {}
-    for name, change in NOMINAL.items():
-        if args.nominal:
-            robots = Robots(change, args)
-            goals = np.linspace(*change.goals, args.nominal)
-            env = robots.env(args.nominal)
-            values[f"{name}_policy_success_rate"] = float(robots.run(env, robots.policy.act, goals).success.mean())
-            act = robots.controller(env, robots.env(args.nominal)).act
-            values[f"{name}_success_rate"] = float(robots.run(env, act, goals).success.mean())
-            announce(f"{name}: {values[f'{name}_success_rate']:.1%}")
-    shares = {}
-    for name in args.changes:
-        robots = Robots(CHANGES[name], args)
-        goals, lost = robots.lost()
-        values |= {f"{name}_lost_rate": lost / args.candidates, f"{name}_robots": float(len(goals))}
-        saved = {}
-        for mode in args.modes if len(goals) else ():
-            saved[mode], found = robots.rescue(mode, goals, folder / name)
-            if found is not None:
-                values |= {f"{name}_identified_{key}": value for key, value in found.means().items()}
-            announce(f"{name}, {mode}: {saved[mode].sum()} of {len(goals)} saved")
-        if saved:
-            values |= {f"{name}_{mode}_saved_rate": float(row.mean()) for mode, row in saved.items()}
-            shares[name] = [row.mean() for row in saved.values()]
-        report(args, folder, values, f"Rescue of jumps with {', '.join(args.changes)}", [])
+    jobs = make_jobs(args, values)
+    results = run_jobs(args, jobs, folder)
+    for (name, mode), (success, changes) in results.items():
+        if name in NOMINAL:
+            values[f"{name}_{mode}_success_rate"] = float(success.mean())
+            continue
+        savable = np.any([results[name, other][0] for other in args.modes], axis=0)
+        values[f"{name}_savable_rate"] = float(savable.mean())
+        values[f"{name}_{mode}_saved_rate"] = float(success.mean())
+        values[f"{name}_{mode}_saved_of_savable_rate"] = float(success.sum() / max(savable.sum(), 1))
+        if changes:
+            found = RobotChange(np.concatenate([change.theta for change in changes], axis=1))
+            values |= {f"{name}_identified_{key}": value for key, value in found.means().items()}
+    names = [name for name in args.changes if (name, args.modes[0]) in results]
     with figure(folder / "rescue.png", title="Jumps that the policy loses and the controller saves") as axis:
         for i, mode in enumerate(args.modes):
-            axis.bar(np.arange(len(shares)) + 0.25 * i, [row[i] for row in shares.values()], 0.25, label=mode)
-        axis.set_xticks(np.arange(len(shares)), list(shares))
+            shares = [values[f"{name}_{mode}_saved_rate"] for name in names]
+            axis.bar(np.arange(len(names)) + 0.25 * i, shares, 0.25, label=mode)
+        axis.set_xticks(np.arange(len(names)), names)
         axis.set_ylabel("share of lost robots")
         axis.legend()
-    return report(args, folder, values, "Rescue of jumps", [key for key in values if "saved" in key or "step" in key])
+    if args.film:
+        film_rescues(args, jobs, results, folder / "rescue.webp")
+    keys = [key for key in values if key.endswith(("saved_rate", "success_rate", "_ms"))]
+    return report(args, folder, values, "Rescue of jumps", keys)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,7 @@ from jumper_warp.cli.compare import CompareCfg
 from jumper_warp.cli.doctor import DoctorCfg
 from jumper_warp.cli.drive import DriveCfg
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
-from jumper_warp.cli.export import ExportCfg
-from jumper_warp.cli.export_robot import ExportRobotCfg
+from jumper_warp.cli.export import ExportCfg, ExportRobotCfg
 from jumper_warp.cli.flags import Flag, list_flags
 from jumper_warp.cli.info import InfoCfg
 from jumper_warp.cli.list import ListCfg, RunsCfg
@@ -33,10 +32,11 @@ from jumper_warp.cli.watch import WatchArgs
 from jumper_warp.deploy.main import parser as deploy_parser
 from jumper_warp.evaluation.agents import AgentCfg
 from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
-from jumper_warp.evaluation.evaluations import default_flags, stock_evaluations
+from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
 from jumper_warp.evaluation.suites import SUITES
-from jumper_warp.registry import make_task
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.tasks.evaluation import EpisodeEvaluation
 from plain_text import to_markdown
 
 EXAMPLE_TASK = "vertical-jump"
@@ -56,7 +56,8 @@ FULL_LIST = 10  # Largest number of flags without a second list
 
 def cli_page() -> str:
     """Return the Markdown of the command reference: a section for each command, then exit codes."""
-    stock = stock_evaluations()
+    of_tasks = [entry.task(name).evaluation for name, entry in TASKS.items() if entry.of_project]
+    stock = {each.kind: each for each in (*of_tasks, EpisodeEvaluation())}
     parts = [
         section("train TASK", COMMANDS["train"], list_flags(TrainArgs), headings={"Common flags": SHORT_HELP},
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),

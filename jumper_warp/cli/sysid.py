@@ -19,7 +19,6 @@ from jumper_warp.utils.files import Json, json_bytes, write_atomically
 
 if TYPE_CHECKING:
     from jumper_warp.identification.results import Identification
-    from jumper_warp.robot.overlay import RobotOverlay
 
 HELP = f"""\
 usage: jumper sysid [fit] DATA ... [flags]
@@ -104,13 +103,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sysid(parse(SysidCfg, "sysid fit", args[1:] if args[0] == "fit" else args))
 
 
-def robot_of(path: Path | None) -> RobotOverlay:
-    """Return the robot of a flag, by default the Jumper. Raises InputError."""
-    from jumper_warp.robot.overlay import RobotOverlay, load_overlay
-
-    return RobotOverlay({}) if path is None else load_overlay(path)
-
-
 def split_names(text: str) -> list[str]:
     """Return the names in a comma-separated text; empty ones are dropped."""
     return [name for name in text.split(",") if name]
@@ -123,12 +115,13 @@ def sysid(cfg: SysidCfg) -> None:
     """
     from jumper_warp.identification.identify import identify
     from jumper_warp.identification.report import write_results
+    from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    robot = robot_of(cfg.robot).description
+    robot = load_overlay(cfg.robot).description
     parameters = jumper_parameters(split_names(cfg.params), robot).without(split_names(cfg.exclude))
     settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["description"] = robot
@@ -192,11 +185,12 @@ def excite(cfg: ExciteCfg) -> None:
     from jumper_warp.identification.excitation import Scorer, choose, record_motions
     from jumper_warp.identification.recording import KINDS
     from jumper_warp.identification.replay import MotionReplay
+    from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    overlay = robot_of(cfg.robot)
+    overlay = load_overlay(cfg.robot)
     robots, robot = overlay.robots(), overlay.description
     parameters = jumper_parameters(split_names(cfg.params), robot)
     configure_device("cpu", cfg.threads)

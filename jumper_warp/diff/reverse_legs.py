@@ -29,12 +29,12 @@ class LegThreadReverse:
         self._modules = dynamics.modules
         self._device = dynamics.model.device
         self._num = dynamics.model.world_count
-        kind = self._modules.leg_adjoint.LegRecord
-        self._record = kind()
-        shape = (SPAN * (every + 1), self._num, 4)
-        for name, field in kind.vars.items():
-            array = wp.zeros(shape[: field.type.ndim], dtype=field.type.dtype, device=self._device)
-            setattr(self._record, name, array)
+        module = self._modules.leg_record
+        shape = {"dtype": dynamics.real, "device": self._device}
+        self._record = module.LegRecord()
+        entries = SPAN * (every + 1)
+        self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
+        self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
 
     def run(self, settings: KernelStruct, motion: list, cotangents: KernelStruct, gradients: KernelStruct) -> None:
         """Backpropagate through a rollout, and add the gradients w.r.t. its inputs to `gradients`.
@@ -57,7 +57,7 @@ class LegThreadReverse:
             """Launch a kernel over `dim` and the four legs, in blocks of whole warps."""
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
-        for end in range(rows.q.shape[0] - 1, 0, -SPAN):
+        for end in range(timing.steps * timing.substeps // timing.every, 0, -SPAN):
             span = legs.Span()
             span.begin, span.end = max(0, end - SPAN), end
             launch(legs.replay_legs_kernel, (end - span.begin, threads), num, robot, settings, *motion, span, record)

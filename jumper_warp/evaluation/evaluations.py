@@ -6,8 +6,7 @@ import importlib
 from dataclasses import fields
 from typing import Any, Literal
 
-from jumper_warp.registry import TASKS
-from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
+from jumper_warp.tasks.evaluation import Evaluation
 
 
 def default_flags(evaluation: Evaluation, command: Literal["evaluate", "play"]) -> Any:
@@ -19,9 +18,3 @@ def default_flags(evaluation: Evaluation, command: Literal["evaluate", "play"]) 
     kind = getattr(importlib.import_module(module), f"{name}{'Play' * (command == 'play')}Flags")
     values = vars(evaluation)
     return kind(**{spec.name: values[spec.name] for spec in fields(kind) if spec.name in values})
-
-
-def stock_evaluations() -> dict[str, Evaluation]:
-    """Return an evaluation of each kind that a stock task has, by `Evaluation.kind`, and that of any task."""
-    stock = [entry.task(name).evaluation for name, entry in TASKS.items() if entry.of_project]
-    return {each.kind: each for each in (*stock, EpisodeEvaluation())}

@@ -16,11 +16,10 @@ from jumper_warp.envs.env import Env
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.policy import Policy
 from jumper_warp.tasks.jump.evaluation import JumpEvaluation
-from jumper_warp.trajectory.plan import Plan, PlanModel, Start
+from jumper_warp.trajectory.plan import LONGEST, SUBSTEPS, Plan, PlanModel, Start
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import turn_plane
 
-LONGEST = 150  # Policy steps from command to touchdown and rest, at most
 SETTLED = 30  # Policy steps of a plan after the touchdown
 SHORTEST = 20  # Policy steps that a plan looks ahead, at least
 SPARE = 1000  # Policy steps that a plan repeats its last actions
@@ -47,13 +46,14 @@ class PredictiveController:
 
     def __init__(
         self, env: Env, policy: Policy, assumed: Env, *, iterations: int = 2, scales: Sequence[float] = SCALES,
-        threads: int | None = None,
+        substeps: int = SUBSTEPS, threads: int | None = None,
     ) -> None:  # fmt: skip
         """Prepare the control of the robots of `env`; plans begin at its next reset.
 
         assumed: environment of the robots as plans assume them, of the same task and num_envs. iterations: of the
         optimisation in a policy step. scales [1]: factors on the goal of the policy's jumps of which the best one is
-        the first plan. threads: as in `Rollout`. Raises InputError: the task is no jump, or has no SolverJumper.
+        the first plan. substeps: physics steps of a plan in a policy step. threads: as in `Rollout`.
+        Raises InputError: the task is no jump, or has no SolverJumper.
         """
         robots = assumed.snapshot()
         if not isinstance(env.task.evaluation, JumpEvaluation) or robots.solver != "SolverJumper":
@@ -64,7 +64,7 @@ class PredictiveController:
         self.iterations = iterations
         self.first_iterations = 0
         self.scales = scales
-        self.model = PlanModel(robots, np.zeros((3, env.num_envs)), threads=threads)
+        self.model = PlanModel(robots, np.zeros((3, env.num_envs)), substeps=substeps, threads=threads)
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actions (num_envs, 12) for the environment's present state; obs: of the policy."""

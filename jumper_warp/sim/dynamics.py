@@ -174,7 +174,7 @@ class JumperDynamics:
 
     def step_record(self, steps: int) -> KernelStruct:
         """Allocate zeroed arrays in which backpropagation records up to `steps` time steps that it recomputes."""
-        record = self.modules.step_adjoint.StepRecord()
+        record = self.modules.multipliers.StepRecord()
         n = self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))

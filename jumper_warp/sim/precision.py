@@ -50,11 +50,12 @@ class KernelModules:
         from jumper_warp.kernels.dynamics.adjoint import (
             constants_adjoint,
             gradients,
-            leg_adjoint,
+            leg_record,
+            multipliers,
             rollout_adjoint,
             rollout_legs_adjoint,
-            step_adjoint,
-        )  # fmt: skip
+            rollout_targets,
+        )
         from jumper_warp.kernels.dynamics.legs import advance_legs, rollout_legs
         from jumper_warp.kernels.dynamics.world import advance, rollout
         from jumper_warp.kernels.jump import plan_cost

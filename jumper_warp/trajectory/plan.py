@@ -8,16 +8,18 @@ depend on takeoff and touchdown of the simulated motion, which have no gradient.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 import warp as wp
 
-from jumper_warp.diff.rollout import Rollout, Trajectory
+from jumper_warp.diff.fixed_rollout import FixedRollout
 from jumper_warp.diff.snapshot import Snapshot
 from jumper_warp.kernels.jump.state import LANDED, STANCE
-from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.threads import WARP_LOCK
 
+LONGEST = 150  # Policy steps of a plan for which arrays are allocated at first
 SUBSTEPS = 4  # Physics steps in a policy step of a plan, half of the simulation's
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of a takeoff, as in the jump tasks
 END = 5  # Last policy steps of a plan, in which the robot should rest at the goal
@@ -58,9 +60,8 @@ class Outlook(NamedTuple):
     """Simulated motion of a plan."""
 
     cost: np.ndarray  # (num_worlds,) [1]
-    trajectory: Trajectory
-    touchdown: np.ndarray  # (num_worlds,) row of the touchdown in the trajectory; the last row if there is none
-    weights: wp.array  # (rows, terms, num_worlds) of the cost
+    q: np.ndarray  # (policy steps + 1, 19, num_worlds) as in `Trajectory`
+    touchdown: np.ndarray  # (num_worlds,) row of the touchdown in q; the last row if there is none
 
 
 class PlanModel:
@@ -72,13 +73,16 @@ class PlanModel:
 
     def __init__(
         self, robots: Snapshot, goal: np.ndarray, *,
-        double: bool = False, threads: int | None = None,
+        substeps: int = SUBSTEPS, double: bool = False, threads: int | None = None,
     ) -> None:  # fmt: skip
-        """Copy the parameters of the robots of an environment of one task on level ground; others as in `Rollout`."""
+        """Copy the parameters of the robots of an environment of one task on level ground.
+
+        substeps: physics steps in a policy step. double, threads: as in `Rollout`.
+        """
         task = robots.tasks[0]
-        self.rollout = Rollout(
+        self.rollout = FixedRollout(
             robots.model, task.motors, task.command_filter, double=double, threads=threads,
-            dt=robots.dt * robots.substeps / SUBSTEPS, substeps=SUBSTEPS,
+            dt=robots.dt * robots.substeps / substeps, substeps=substeps,
         )  # fmt: skip
         for name, tensor in robots.parameters.items():
             wp.to_torch(self.rollout.parameters[name]).copy_(tensor)
@@ -89,42 +93,69 @@ class PlanModel:
         self.goal = goal
         self.tolerances = Tolerances()
         self.terms = self.rollout.dynamics.modules.plan_cost
-        self._kernel: Kernel = self.terms.plan_cost_kernel
+        self._rows = 0  # of the arrays
+        self._allocate(LONGEST)
+
+    def _allocate(self, horizon: int) -> None:
+        """Allocate the arrays of plans of at most `horizon` policy steps, and record the launches of the cost."""
+        rollout = self.rollout
+        rollout.allocate(horizon)
+        self._rows = horizon + 1
+        n, device = rollout.num_worlds, rollout.device
+        shapes = ((12, n), (3, n), (self._rows, int(self.terms.TERMS), n), (n,))
+        pose, goal, weight, cost = (wp.zeros(shape, dtype=rollout.real, device=device) for shape in shapes)
+        self._constants, self._cost = [wp.to_torch(array) for array in (pose, goal, weight)], wp.to_torch(cost)
+        q, qd, by_q, by_qd = (wp.from_torch(row) for row in (rollout.q, rollout.qd, rollout.by_q, rollout.by_qd))
+        launch = {
+            "kernel": self.terms.plan_cost_kernel, "dim": (1, n, 4), "device": device, "record_cmd": True,
+                  "inputs": [rollout.dynamics.robot.geometry, pose, goal, weight, q, qd], "outputs": [cost],
+        }  # fmt: skip
+        self._add_cost = wp.launch(**launch)
+        ones = wp.ones(n, dtype=rollout.real, device=device)
+        self._reverse_cost = wp.launch(
+            **launch, adjoint=True, adj_inputs=[None, None, None, None, by_q, by_qd], adj_outputs=[ones]
+        )
 
     def simulate(self, actions: np.ndarray, start: Start) -> Outlook:
         """Simulate actions (policy steps, 12, num_worlds) within ±1 from a start, and return motion and cost."""
+        if len(actions) >= self._rows:
+            self._allocate(len(actions))
         rollout = self.rollout
-        targets = self.default + self.scale * actions
-        motion = rollout.run(targets, start.q, start.qd, initial_target=start.initial_target)
-        takeoff, touchdown = self._events(motion, start)
-        weights = rollout.array(self._weights(motion.q.numpy(), start, takeoff, touchdown))
-        cost = wp.zeros(rollout.num_worlds, dtype=rollout.real, device=rollout.device)
-        wp.launch(self._kernel, *self._inputs(motion, weights), outputs=[cost], device=rollout.device)
-        return Outlook(np.nan_to_num(cost.numpy(), nan=DIVERGED, posinf=DIVERGED), motion, touchdown, weights)
+        rows = rollout.forward(self.default + self.scale * actions, start.q, start.qd, start.initial_target)
+        q, qd, impulse = (array.cpu().numpy() for array in (rollout.q[:rows], rollout.qd[:rows], rollout.impulse))
+        takeoff, touchdown = self._events(qd, impulse[: (rows - 1) * rollout.substeps], start)
+        weights = self._weights(q, start, takeoff, touchdown)
+        for into, values in zip(self._constants, (self.pose, self.goal, weights), strict=True):
+            into[: len(values)].copy_(torch.from_numpy(values))
+        self._cost.zero_()
+        self._launch(self._add_cost, rows)
+        cost = np.nan_to_num(self._cost.cpu().numpy(), nan=DIVERGED, posinf=DIVERGED)
+        return Outlook(cost, q.copy(), touchdown)
 
     def gradient(self, outlook: Outlook) -> np.ndarray:
-        """Return the gradient of the worlds' costs w.r.t. the actions, (policy steps, 12, num_worlds); 0 for NaN."""
-        motion = outlook.trajectory
-        by_q, by_qd = wp.zeros_like(motion.q), wp.zeros_like(motion.qd)
-        ones = wp.ones(self.rollout.num_worlds, dtype=self.rollout.real, device=self.rollout.device)
-        wp.launch(
-            self._kernel, *self._inputs(motion, outlook.weights), outputs=[wp.zeros_like(ones)], adjoint=True,
-            adj_inputs=[None, None, None, None, by_q, by_qd], adj_outputs=[ones], device=self.rollout.device,
-        )  # fmt: skip
-        by_targets = self.rollout.backward(motion, q=by_q, qd=by_qd)["targets"].numpy()
-        return np.nan_to_num(by_targets * self.scale, nan=0.0, posinf=0.0, neginf=0.0)
+        """Return the gradient of the worlds' costs w.r.t. the actions, (policy steps, 12, num_worlds); 0 for NaN.
 
-    def _inputs(self, motion: Trajectory, weights: wp.array) -> tuple[tuple[int, ...], list]:
-        """Return dimensions and inputs of the kernel of the cost."""
-        rows, _, n = motion.q.shape
-        constants = [self.rollout.array(values) for values in (self.pose, self.goal)]
-        return (rows, n, 4), [self.rollout.dynamics.robot.geometry, *constants, weights, motion.q, motion.qd]
+        outlook: the last result of `simulate`.
+        """
+        rows = len(outlook.q)
+        self.rollout.by_q[:rows] = self.rollout.by_qd[:rows] = 0.0
+        self._launch(self._reverse_cost, rows)
+        return np.nan_to_num(self.rollout.reverse() * self.scale, nan=0.0, posinf=0.0, neginf=0.0)
 
-    def _events(self, motion: Trajectory, start: Start) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of takeoff and touchdown, (num_worlds,), as the jump tasks define them; 0: before."""
-        force = np.abs(motion.impulse.numpy()).max((1, 3))
+    def _launch(self, launch: Any, rows: int) -> None:
+        """Launch a recorded kernel of the cost, a `wp.Launch`, over some rows."""
+        launch.set_dim((rows, self.rollout.num_worlds, 4))
+        with WARP_LOCK:
+            launch.launch()
+
+    def _events(self, qd: np.ndarray, impulse: np.ndarray, start: Start) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows of takeoff and touchdown, (num_worlds,), as the jump tasks define them; 0: before.
+
+        qd, impulse: as in `Trajectory`.
+        """
+        force = np.abs(impulse).max((1, 3))
         down = force[self.rollout.substeps - 1 :: self.rollout.substeps] > 1.0e-6
-        rises = motion.qd.numpy()[1:, 2] > TAKEOFF_SPEED
+        rises = qd[1:, 2] > TAKEOFF_SPEED
         takeoff = np.where(start.phase == int(STANCE), first_row(~down & rises), 0)
         after = np.arange(1, len(down) + 1)[:, None] > takeoff
         return takeoff, np.where(start.phase == int(LANDED), 0, first_row(down & ~rises & after))

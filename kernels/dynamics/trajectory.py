@@ -15,6 +15,9 @@ from ..state import BaseState
 
 wp.set_module_options({"enable_backward": False})
 
+CPU_FLAGS = "-march=native -mllvm=-inline-threshold=200000 -mllvm=-inline-cold-callsite-threshold=3000"
+"""Compiler flags of the kernels that plans wait for: all functions in one, without what only unused results need."""
+
 ROW_COORDS = wp.constant(19)  # entries of a row of q: base position (3) and orientation (4, xyzw), motor angles (12)
 ROW_RATES = wp.constant(18)  # of qd: velocity of the base's com (3), angular velocity (3), world; motor rates (12)
 

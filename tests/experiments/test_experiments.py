@@ -17,9 +17,8 @@ from experiments import (
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import run_evaluation, within
-from jumper_warp.evaluation.sweeps import HeightSweep
+from jumper_warp.evaluation.sweeps import HeightSweep, limit_metrics
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
@@ -194,15 +193,19 @@ def test_springs_raise_the_apex(tmp_path):
     assert values["stock_highest_apex_height_m"] == with_springs and (tmp_path / "springs.png").is_file()
 
 
-def test_weak_motor_is_identified_from_a_lost_jump(tmp_path):
+def test_rescue_identifies_a_weak_motor_in_two_processes_and_lists_outcomes(tmp_path):
     args = rescue.Args(
-        changes=("weak_motor",), modes=("identified",), count=1, nominal=0, timed=0, candidates=8, threads=1,
-        out=tmp_path, device="cpu",
+        changes=("weak_motor",), modes=("known", "identified"), count=1, nominal=0, timed=0, candidates=8, seed=0,
+        processes=2, threads=1, out=tmp_path, device="cpu",
     )  # fmt: skip
     values = rescue.main(args)
     assert values["weak_motor_identified_smallest_torque_factor"] == pytest.approx(0.5, abs=0.05)
     assert abs(values["weak_motor_identified_added_mass_kg"]) < 0.2
-    assert (tmp_path / "weak_motor" / "identified.rrd").stat().st_size > 10_000
+    rows = json.loads((tmp_path / "outcomes.json").read_text())
+    saved = np.array([[row["outcome"] == "success" for row in rows if row["mode"] == mode] for mode in args.modes])
+    assert saved.shape == (2, 1) and saved.any()
+    assert values["weak_motor_savable_rate"] == saved.any(0).mean()
+    assert values["weak_motor_known_saved_of_savable_rate"] == saved[0].sum() / saved.any(0).sum()
 
 
 def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):

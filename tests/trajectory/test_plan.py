@@ -55,6 +55,6 @@ def test_improved_plan_ends_closer_to_its_goal(jump):
     assert after.cost == pytest.approx(cost, rel=1.0e-5)
 
     def distance(outlook):
-        return np.linalg.norm(outlook.trajectory.q.numpy()[-1, :2] - goal[:2], axis=0)
+        return np.linalg.norm(outlook.q[-1, :2] - goal[:2], axis=0)
 
     assert (distance(after) < 0.6 * distance(before)).all()

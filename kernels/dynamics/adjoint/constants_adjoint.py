@@ -14,7 +14,8 @@ from ..trajectory import Actuation, Commands, Timing, TrajectoryArrays, load_wor
 from .action_gradients import leg_action_gradient
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
-from .leg_adjoint import LegRecord, add_leg_constants, base_factors, leg_factors
+from .leg_adjoint import add_leg_constants, base_factors, leg_factors
+from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
 
@@ -80,14 +81,14 @@ def leg_constants_kernel(
         at = span_step(timing, span, k * threads_per_leg + thread)
         sums.weight = at.weight
         i = at.entry
-        base = record.base[i, world]
-        law = record.law[i, world, leg]
-        base_held = base_factors(record, world, i, dt, base, record.base_weights[i, world])
-        weights = record.weights[i, world, leg]
+        base = get_base(record, i, world)
+        law = get_law(record, i, world, leg)
+        base_held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
+        weights = get_leg_weights(record, i, world, leg)
         leg_held = leg_factors(record, trajectory, cotangent, world, at.step, i, leg, dt, law, weights)
         gradient = leg_action_gradient(
-            model, params, world, leg, law.mu, base, record.angles[i, world, leg],
-            record.rates[i, world, leg], base_held, leg_held, dt,
+            model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
+            get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
         )  # fmt: skip
         add_leg_constants(sums, leg, law, gradient)
 
@@ -124,9 +125,9 @@ def motor_constants_kernel(
         at = span_step(timing, span, k * threads_per_leg + thread)
         leg_sums.weight = at.weight
         shared_sums.weight = at.weight
-        angles = record.angles[at.entry, world, leg]
-        rates = record.rates[at.entry, world, leg]
-        torque = settings.dt * record.weights[at.entry, world, leg].rates
+        angles = get_vec(record, at.entry, ANGLES, world, leg)
+        rates = get_vec(record, at.entry, RATES, world, leg)
+        torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
         if cotangent.torque.shape[0] > 0:
             torque += row_vec3(cotangent.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
@@ -137,7 +138,7 @@ def motor_constants_kernel(
             add_motor_constants(leg_sums, shared_sums, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))
         if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:
-            by_filter = record.by_filter[at.entry, world, leg]
+            by_filter = get_vec(record, at.entry, FILTER, world, leg)
         add_offsets(leg_sums, leg, by_filter)
 
 

@@ -63,6 +63,13 @@ class ThreadSums:
     over_legs: bool  # whether to sum over threads with other legs
 
 
+@wp.struct
+class NoSums:
+    """Destination of gradients w.r.t. parameters that nobody reads."""
+
+    unused: int
+
+
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
     """Return the `ThreadSums` with which a GPU thread adds to a world's `gradients.parameters`, with weight 1.
@@ -96,6 +103,12 @@ def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
         total = sum_legs(total)
     if sums.writes:
         wp.atomic_add(sums.parameters, row, sums.world, total)
+
+
+@wp.func
+def add_entry(sums: NoSums, row: int, x: real):  # noqa: F811
+    """Discard the gradient w.r.t. a parameter."""
+    return
 
 
 @wp.func

@@ -17,17 +17,7 @@ from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_f
 from ...layout import GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ...scalar import mat33, real, vec3
 from ...state import BaseState
-from ..base_dynamics import (
-    BaseInverse,
-    BaseSystem,
-    LegSolve,
-    add_leg,
-    invert,
-    motor_acceleration,
-    solve_ang,
-    solve_lin,
-    sum_systems,
-)
+from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
 from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
@@ -35,87 +25,13 @@ from ..inertia import MassMoments
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import TrajectoryArrays, row_vec3
-from . import action_gradients
+from . import action_gradients, leg_record
 from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient, make_base_factors
 from .gradients import ThreadSums, add_entry, add_leg_parameters
-from .virtual_power import BaseCotangent, BaseFactors, LegFactors, add, rotation_adjoint_scalar
+from .leg_record import ANGLES, RATES, BaseWeights, LawRow, LegLaw, LegRecord, LegWeights
+from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
-
-
-@wp.struct
-class BaseWeights:
-    """Solved adjoint multipliers of the base's equations of motion in a step, body axes."""
-
-    lin: vec3  # virtual velocity, see `virtual_power`
-    ang: vec3  # virtual angular velocity
-    cotangent: BaseCotangent
-
-
-@wp.struct
-class LegWeights:
-    """Solved adjoint multipliers of a leg's equations of motion and of its paw's contact law in a step.
-
-    The pass backwards in time computes these multipliers. The kernels of `constants_adjoint` read them, for all steps
-    in parallel.
-    """
-
-    rates: vec3  # virtual rates of the motors
-    law: vec3  # multiplier of the contact law, body axes
-
-
-@wp.struct
-class MotorSlopes:
-    """Derivatives of each of a leg's motor torques w.r.t. its own target, angle and rate; lateral, outer, inner."""
-
-    target: vec3  # [N m/rad]
-    angle: vec3  # [N m/rad]
-    rate: vec3  # [N m s/rad]
-
-
-@wp.struct
-class LegLaw:
-    """Contact law of a paw, linearised at the solution of a step, as the reverse pass records it."""
-
-    mode: int  # SEPARATE, STICK or SLIDE
-    mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real  # friction coefficient
-    impulse: vec3  # [N s], body axes
-    point: vec3  # [m] where the paw touches, body axes, from the base's origin
-    jacobian: mat33  # contact velocity per motor rate [m/rad]
-    to_lin: mat33  # change of the base's linear velocity per impulse [1/kg]
-    to_ang: mat33  # change of its angular velocity per impulse [1/(kg m)]
-    by_velocity: mat33  # derivative of the law w.r.t. the contact velocity, see `contact_laws.PawLaw`
-
-
-@wp.struct
-class LawRow:
-    """One paw's row in the inverse of the 12x12 contact-law matrix A^T (`step_adjoint`): a 3x3 block per paw."""
-
-    a: mat33  # FL
-    b: mat33  # FR
-    c: mat33  # BL
-    d: mat33  # BR
-
-
-@wp.struct
-class LegRecord:
-    """Record of successive physics steps for the reverse pass: an entry per step, and one for the final state.
-
-    Arrays of the base are (entries, num_worlds), of legs (entries, num_worlds, 4).
-    """
-
-    base: wp.array2d(dtype=BaseState)  # at the start of the step
-    inverse: wp.array2d(dtype=BaseInverse)  # of the base's equations of motion, a 6x6 matrix
-    base_weights: wp.array2d(dtype=BaseWeights)
-    angles: wp.array3d(dtype=vec3)  # [rad] lateral, outer, inner
-    rates: wp.array3d(dtype=vec3)  # [rad/s]
-    solve: wp.array3d(dtype=LegSolve)  # motor accelerations by the base's acceleration
-    slopes: wp.array3d(dtype=MotorSlopes)
-    law: wp.array3d(dtype=LegLaw)
-    law_row: wp.array3d(dtype=LawRow)  # defined only where a paw of the world touches
-    weights: wp.array3d(dtype=LegWeights)
-    by_filter: wp.array3d(dtype=vec3)  # gradient w.r.t. the angles that the filter reads, where a policy step begins
 
 
 @wp.struct
@@ -167,9 +83,9 @@ def replay_leg(
     base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same bits
     for the base; see `replay_step`.
     """
-    base = record.base[i, world]
-    rates = record.rates[i, world, leg]
-    angles = record.angles[i, world, leg]
+    base = leg_record.get_base(record, i, world)
+    rates = leg_record.get_vec(record, i, RATES, world, leg)
+    angles = leg_record.get_vec(record, i, ANGLES, world, leg)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = row_vec3(trajectory.torque, step, 3 * leg, world)
     stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
@@ -181,7 +97,7 @@ def replay_leg(
     system = sum_systems(base_system(model, world, base, g, force, moment), leg_system)
     inverse = hold_base(model, world, invert(system))
     solve = terms.solve
-    record.inverse[i, world] = inverse
+    leg_record.put_inverse(record, i, world, inverse)
     paw = terms.paw
     c = PawContact()
     push = vec3(real(0.0))
@@ -196,16 +112,16 @@ def replay_leg(
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)
-    record.solve[i, world, leg] = solve
+    leg_record.put_solve(record, i, world, leg, solve)
     push = dt * system.force + sum_vec(push)
     twist = dt * system.moment + sum_vec(twist)
     lin = solve_lin(inverse, push, twist)
     ang = solve_ang(inverse, push, twist)
     new_rates = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
-    record.rates[i + 1, world, leg] = new_rates
-    record.angles[i + 1, world, leg] = angles + dt * new_rates
+    leg_record.put_vec(record, i + 1, RATES, world, leg, new_rates)
+    leg_record.put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
-    record.base[i + 1, world] = integrate_base(base, old_lin + lin, base.ang + ang, dt)
+    leg_record.put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
         old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
@@ -215,8 +131,8 @@ def replay_leg(
             old_impulse = trajectory.impulse[step - 1, leg, world]
         law = paw_law(model, world, leg, c, old_velocity, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
-        record.law_row[i, world, leg] = inverted_laws(c, law, leg)
-    record.law[i, world, leg] = leg_law(c, law, impulse, point)
+        leg_record.put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
+    leg_record.put_law(record, i, world, leg, leg_law(c, law, impulse, point))
 
 
 @wp.func
@@ -306,7 +222,7 @@ def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseStat
 
     i: entry of the step, of dt [s], in the record; base: state at its start.
     """
-    return make_base_factors(base, record.base[i + 1, world], weights.lin, weights.ang, dt)
+    return make_base_factors(base, leg_record.get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
 @wp.func
@@ -323,7 +239,7 @@ def leg_factors(
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
     return action_gradients.make_leg_factors(
-        record.rates[i, world, leg], record.rates[i + 1, world, leg],
+        leg_record.get_vec(record, i, RATES, world, leg), leg_record.get_vec(record, i + 1, RATES, world, leg),
         weights.rates, law.mode, int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
 
@@ -350,8 +266,8 @@ def find_weights(
     velocities of the base, in the body axes at the start of the step. rate_cotangent: gradient w.r.t. the rates of the
     motors. i: entry of the step in the record.
     """
-    inverse = record.inverse[i, world]
-    solve = record.solve[i, world, leg]
+    inverse = leg_record.get_inverse(record, i, world)
+    solve = leg_record.get_solve(record, i, world, leg)
     weights = StepWeights()
     weights.lin = lin_cotangent
     weights.ang = ang_cotangent
@@ -371,7 +287,7 @@ def find_weights(
             impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        weights.leg.law = multiplier(record.law_row[i, world, leg], impulse_cotangent)
+        weights.leg.law = multiplier(leg_record.get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
             y = wp.transpose(law.by_velocity) * weights.leg.law
         joint = wp.transpose(law.jacobian) * y
@@ -398,11 +314,11 @@ def reverse_leg(
     in the rollout. force [N], moment [N m]: on the base at its com, world axes. writes_record: whether this thread
     writes the step's multipliers to the record.
     """
-    base = record.base[i, world]
-    law = record.law[i, world, leg]
+    base = leg_record.get_base(record, i, world)
+    law = leg_record.get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
     quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
-        base.quat, record.base[i + 1, world].ang, dt, adj.base.quat
+        base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
     )
     weights = find_weights(
         record, world, leg, cotangent, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
@@ -413,16 +329,16 @@ def reverse_leg(
     base_held = base_factors(record, world, i, dt, base, base_weights)
     leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights.leg)
     gradient = leg_action_gradient(
-        model, params, world, leg, law.mu, base, record.angles[i, world, leg],
-        record.rates[i, world, leg], base_held, leg_held, dt,
+        model, params, world, leg, law.mu, base, leg_record.get_vec(record, i, ANGLES, world, leg),
+        leg_record.get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
     )  # fmt: skip
     base_weights.cotangent.velocity = weights.lin
     base_weights.cotangent.new_velocity = new_velocity
     base_weights.cotangent.gravity = sum_vec(gradient.gravity)
     by_base = base_action_gradient(model, world, force, moment, base, base_held, base_weights.cotangent, dt)
     if writes_record:
-        record.base_weights[i, world] = base_weights
-        record.weights[i, world, leg] = weights.leg
+        leg_record.put_base_weights(record, i, world, base_weights)
+        leg_record.put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
     out.base.pos = adj.base.pos + sum_vec(gradient.pos)
     out.base.quat = quat_adj + by_base.quat + sum_quat(gradient.quat)

@@ -10,6 +10,8 @@ angular velocity in body axes. A cotangent is the gradient of the loss w.r.t. a 
 it to the gradient w.r.t. the arguments. `legs`, `sums`: the thread's gradients w.r.t. motors and parameters so far.
 """
 
+from typing import Any
+
 import warp as wp
 
 from ...actuation.motors import MotorParams, motor_torque
@@ -35,8 +37,9 @@ from ..trajectory import (
 )
 from . import command_adjoint
 from .command_adjoint import FilterAdjoint, MotorAdjoint
-from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
-from .step_adjoint import LegReverse, ReplayedStep, StepRecord, replay_step, reverse_step
+from .gradients import GRADIENT_ROWS, Gradients, NoSums, add_com, add_filter
+from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
+from .step_adjoint import reverse_step
 from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
@@ -211,7 +214,7 @@ def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: ve
 @wp.func
 def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
-    gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+    gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: Any,
 ):  # fmt: skip
     """Backpropagate through a motor's torque in a step, and add the gradients to `legs`, `sums` and `gradients`.
 
@@ -238,7 +241,7 @@ def add_motor_adjoint(
 @wp.func
 def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
-    sums: wp.array(dtype=real),
+    sums: Any,
 ):  # fmt: skip
     """Store the gradient w.r.t. leg k's targets in policy step t, and add the gradients of its filter's other inputs.
 
@@ -269,78 +272,6 @@ def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3
     for i in range(3):
         gradients.q[7 + 3 * leg + i, world] = angles[i]
         gradients.qd[6 + 3 * leg + i, world] = rates[i]
-
-
-@wp.kernel
-def reverse_kernel(
-    # in
-    model: RobotModel,
-    settings: StepSettings,
-    timing: Timing,
-    actuation: Actuation,
-    commands: Commands,
-    filtered_target: wp.array3d(dtype=real),
-    trajectory: TrajectoryArrays,
-    cotangent: TrajectoryArrays,
-    # out
-    record: StepRecord,
-    gradients: Gradients,
-):
-    """Compute the gradient of a loss w.r.t. all inputs of a rollout; one thread per world.
-
-    cotangent: gradient w.r.t. the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
-    `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
-    """
-    world = settings.first + wp.tid()
-    legs = wp.zeros(shape=(4,), dtype=LegReverse)
-    sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
-    params = wp.zeros(shape=(4,), dtype=LegParams)
-    motors = wp.zeros(shape=(12,), dtype=MotorParams)
-    load_parts(model, actuation, world, params, motors)
-    delay = actuation.latency[world] / settings.dt
-    last = timing.steps * timing.substeps / timing.every
-    entries = add_row_cotangent(RowCotangent(), cotangent, last, world)
-    add_motor_rows(legs, cotangent, last, world)
-    com = base_com(model.table, world)
-    for back in range(last):
-        row = last - 1 - back
-        t = row * timing.every / timing.substeps
-        at = replayed_step(commands, t, settings.dt, world)
-        replay_row(model, params, at, trajectory, row, timing.every, com, record)
-        end = store_row_base_adjoint(model, world, record.base[world, timing.every], entries)
-        adj = end.base
-        for j in range(timing.every):
-            at.entry = timing.every - 1 - j
-            at.step = row * timing.every + at.entry
-            by_step = reverse_step(
-                model, params, at, commands.impulse, trajectory, cotangent, record, adj, legs, sums,
-            )  # fmt: skip
-            adj = by_step.base
-            add_wrench(gradients, t, world, by_step.force, by_step.moment)
-            arrived = arrival(at.step, timing.substeps, delay)
-            for i in range(motors.shape[0]):
-                angle = record.angles[world, at.entry, i / 3][i % 3]
-                rate = record.rates[world, at.entry, i / 3][i % 3]
-                by_motor = command_adjoint.motor_gradient(
-                    motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
-                )
-                add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
-        entries = add_row_cotangent(
-            load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world
-        )
-        if row * timing.every == t * timing.substeps:
-            for k in range(legs.shape[0]):
-                by_filter = command_adjoint.filter_gradient(
-                    commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
-                )
-                add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
-        add_motor_rows(legs, cotangent, row, world)
-    add_com(sums, model.table[BASE, world], com, entries.com)
-    for i in range(sums.shape[0]):
-        gradients.parameters[i, world] = sums[i]
-    store_base_entries(gradients, world, entries)
-    for k in range(legs.shape[0]):
-        store_motor_entries(gradients, world, k, legs[k].angles, legs[k].rates)
 
 
 @wp.func
@@ -393,4 +324,96 @@ def generate_adjoints(module: str) -> wp.Kernel:
     return adjoints_kernel
 
 
-ADJOINTS = generate_adjoints(__name__)
+def make_reverse_kernel(module: str, by_parameters: bool) -> wp.Kernel:
+    """Return the kernel of the reverse pass for a module of kernels, and make Warp generate the adjoints it calls.
+
+    module: `__name__` of the module. by_parameters: whether to compute gradients w.r.t. the robot's parameters.
+    """
+    generate_adjoints(module)
+
+    @wp.kernel(module=wp.get_module(module))
+    def reverse_kernel(
+        # in
+        model: RobotModel,
+        settings: StepSettings,
+        timing: Timing,
+        actuation: Actuation,
+        commands: Commands,
+        filtered_target: wp.array3d(dtype=real),
+        trajectory: TrajectoryArrays,
+        cotangent: TrajectoryArrays,
+        # out
+        record: StepRecord,
+        gradients: Gradients,
+    ):
+        """Compute the gradient of a loss w.r.t. all inputs of a rollout; one thread per world.
+
+        cotangent: gradient w.r.t. the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass,
+        like `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
+        """
+        world = settings.first + wp.tid()
+        legs = wp.zeros(shape=(4,), dtype=LegReverse)
+        if wp.static(by_parameters):
+            sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
+        else:
+            sums = NoSums()
+        params = wp.zeros(shape=(4,), dtype=LegParams)
+        motors = wp.zeros(shape=(12,), dtype=MotorParams)
+        load_parts(model, actuation, world, params, motors)
+        delay = actuation.latency[world] / settings.dt
+        last = timing.steps * timing.substeps / timing.every
+        entries = add_row_cotangent(RowCotangent(), cotangent, last, world)
+        add_motor_rows(legs, cotangent, last, world)
+        com = base_com(model.table, world)
+        for back in range(last):
+            row = last - 1 - back
+            t = row * timing.every / timing.substeps
+            at = replayed_step(commands, t, settings.dt, world)
+            replay_row(model, params, at, trajectory, row, timing.every, com, record)
+            end = store_row_base_adjoint(model, world, record.base[world, timing.every], entries)
+            adj = end.base
+            for j in range(timing.every):
+                at.entry = timing.every - 1 - j
+                at.step = row * timing.every + at.entry
+                by_step = reverse_step(
+                    model, params, at, commands.impulse, trajectory, cotangent, record, adj, legs, sums,
+                )  # fmt: skip
+                adj = by_step.base
+                add_wrench(gradients, t, world, by_step.force, by_step.moment)
+                arrived = arrival(at.step, timing.substeps, delay)
+                for i in range(motors.shape[0]):
+                    angle = record.angles[world, at.entry, i / 3][i % 3]
+                    rate = record.rates[world, at.entry, i / 3][i % 3]
+                    by_motor = command_adjoint.motor_gradient(
+                        motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
+                    )
+                    add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
+            entries = add_row_cotangent(
+                load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world
+            )
+            if row * timing.every == t * timing.substeps:
+                for k in range(legs.shape[0]):
+                    by_filter = command_adjoint.filter_gradient(
+                        commands,
+                        actuation,
+                        t,
+                        k,
+                        world,
+                        record.angles[world, 0, k],
+                        record.rates[world, 0, k],
+                        gradients,
+                    )
+                    add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
+            add_motor_rows(legs, cotangent, row, world)
+        add_com(sums, model.table[BASE, world], com, entries.com)
+        if wp.static(by_parameters):
+            for i in range(sums.shape[0]):
+                gradients.parameters[i, world] = sums[i]
+        store_base_entries(gradients, world, entries)
+        for k in range(legs.shape[0]):
+            store_motor_entries(gradients, world, k, legs[k].angles, legs[k].rates)
+
+    return reverse_kernel
+
+
+reverse_kernel = make_reverse_kernel(__name__, by_parameters=True)

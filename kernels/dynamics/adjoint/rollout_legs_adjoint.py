@@ -30,10 +30,11 @@ from ..trajectory import (
     row_vec3,
     store_row_vec3,
 )
-from . import rollout_adjoint
+from . import leg_record, rollout_adjoint
 from .command_adjoint import add_targets, filter_gradient, motor_gradient
 from .gradients import Gradients, add_com, add_filter, add_moments, add_vec3, thread_sums
-from .leg_adjoint import LegAdjoint, LegRecord, MotorSlopes, replay_leg, reverse_leg
+from .leg_adjoint import LegAdjoint, replay_leg, reverse_leg
+from .leg_record import ANGLES, FILTER, RATES, LegRecord, MotorSlopes
 from .rollout_adjoint import RowCotangent, generate_adjoints
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -85,9 +86,9 @@ def replay_legs_kernel(
     params = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    record.base[start_entry, world] = load_row_base(trajectory, row, world, base_com(model.table, world))
-    record.angles[start_entry, world, leg] = row_vec3(trajectory.q, row, 7 + 3 * leg, world)
-    record.rates[start_entry, world, leg] = row_vec3(trajectory.qd, row, 6 + 3 * leg, world)
+    leg_record.put_base(record, start_entry, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
+    leg_record.put_vec(record, start_entry, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
+    leg_record.put_vec(record, start_entry, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
     sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
@@ -100,8 +101,8 @@ def replay_legs_kernel(
             record,
         )  # fmt: skip
         sync_lanes()
-        angles = record.angles[start_entry + i, world, leg]
-        rates = record.rates[start_entry + i, world, leg]
+        angles = leg_record.get_vec(record, start_entry + i, ANGLES, world, leg)
+        rates = leg_record.get_vec(record, start_entry + i, RATES, world, leg)
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
@@ -111,7 +112,7 @@ def replay_legs_kernel(
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
             slopes.rate[c] = by_motor.rate
-        record.slopes[start_entry + i, world, leg] = slopes
+        leg_record.put_slopes(record, start_entry + i, world, leg, slopes)
 
 
 @wp.func
@@ -200,7 +201,7 @@ def reverse_legs_kernel(
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
         end = rollout_adjoint.store_row_base_adjoint(
-            model, world, record.base[start_entry + timing.every, world], entries
+            model, world, leg_record.get_base(record, start_entry + timing.every, world), entries
         )
         adj.base = end.base
         adj.force = vec3(real(0.0))
@@ -213,7 +214,7 @@ def reverse_legs_kernel(
                 index < count,
             )  # fmt: skip
             arrived = arrival(step, timing.substeps, delay)
-            slopes = record.slopes[start_entry + i, world, leg]
+            slopes = leg_record.get_slopes(record, start_entry + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)
         entries = rollout_adjoint.add_row_cotangent(
             rollout_adjoint.load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com),
@@ -226,12 +227,12 @@ def reverse_legs_kernel(
                 rollout_adjoint.add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
-                commands, actuation, t, leg, world, record.angles[start_entry, world, leg],
-                record.rates[start_entry, world, leg], gradients,
+                commands, actuation, t, leg, world, leg_record.get_vec(record, start_entry, ANGLES, world, leg),
+                leg_record.get_vec(record, start_entry, RATES, world, leg), gradients,
             )  # fmt: skip
             add_filter(shared_sums, by_filter.constants)
             if index < count:
-                record.by_filter[start_entry, world, leg] = by_filter.angles
+                leg_record.put_vec(record, start_entry, FILTER, world, leg, by_filter.angles)
                 store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates

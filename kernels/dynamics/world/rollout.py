@@ -18,7 +18,7 @@ from ..step import RobotModel, StepSettings
 from .advance import advance_once
 from .world_step import LegStep
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": rows.CPU_FLAGS})
 
 
 @wp.kernel
