@@ -19,7 +19,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "sim.simulation", "sim.solver", "sim.mujoco", "sim.dynamics", "sim.model_parts",
     )),
     "robot": ("Robot", (
-        "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.grounds",
+        "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.bounds", "robot.grounds",
         "robot.terrain", "robot.gravity", "robot.export",
     )),
     "tasks": ("Tasks", (
@@ -43,7 +43,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "evaluation.log", "evaluation.commands", "evaluation.suites",
         "evaluation.sweeps", "evaluation.episodes", "evaluation.jump_metrics",
         "evaluation.velocities", "evaluation.attitude", "evaluation.jumps", "evaluation.courses",
-        "evaluation.scripts", "evaluation.recorder", "evaluation.finetuning",
+        "evaluation.scripts", "evaluation.recorder", "evaluation.limits", "evaluation.finetuning",
         "evaluation.finetuning_cfg",
     )),
     "identification": ("Identification", (

@@ -15,7 +15,8 @@ from jumper_warp.cli.compare import CompareCfg
 from jumper_warp.cli.doctor import DoctorCfg
 from jumper_warp.cli.drive import DriveCfg
 from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
-from jumper_warp.cli.export import ExportCfg, ExportRobotCfg
+from jumper_warp.cli.export import ExportCfg
+from jumper_warp.cli.export_robot import ExportRobotCfg
 from jumper_warp.cli.flags import Flag, list_flags
 from jumper_warp.cli.info import InfoCfg
 from jumper_warp.cli.list import ListCfg, RunsCfg

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -35,40 +35,17 @@ class ExportCfg:
     """Write a folder for the robot: policies with their conformance vectors, deploy.yaml and the runtime deploy.pyz."""
 
 
-@dataclass(frozen=True)
-class ExportRobotCfg:
-    """Write the robot for another simulator: MJCF (MuJoCo), URDF with closed loops as YAML, or USD (needs usd-core)."""
-
-    out: Path
-    """Folder to write to; existing files are replaced."""
-    format: Literal["mjcf", "urdf", "usd"] = "mjcf"
-    robot: Path | None = None
-    """Folder or name of a robot, or overlay (docs/reference/overlays.md); by default the Jumper."""
-
-
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper export` or `jumper export robot`; raises as `export` or `export_robot`.
 
     modules: unused; all commands take it.
     """
     if args[:1] == ["robot"]:
-        _export_robot(args[1:])
-    else:
-        export(parse(ExportCfg, "export", args))
+        from jumper_warp.cli import export_robot
 
-
-def _export_robot(args: Sequence[str]) -> None:
-    """Write the robot as a file of another simulator; args: after the words `export robot`."""
-    cfg: ExportRobotCfg = parse(ExportRobotCfg, "export robot", args)
-    from jumper_warp.robot.export import LOST, export_robot
-    from jumper_warp.robot.overlay import load_overlay
-
-    overlay = None if cfg.robot is None else load_overlay(cfg.robot)
-    path = export_robot(cfg.format, cfg.out, overlay)
-    lost = [] if overlay is None else [name for name in overlay.values if name in LOST[cfg.format]]
-    if lost:
-        print(f"{cfg.format} has no place for these values of {cfg.robot}: {', '.join(lost)}")
-    print(path)
+        export_robot.run(args[1:])
+        return
+    export(parse(ExportCfg, "export", args))
 
 
 def export(cfg: ExportCfg) -> Path:

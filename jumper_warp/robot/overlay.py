@@ -11,10 +11,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from jumper_warp.robot import bounds
+from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.folder import FILE, read_robot, robot_of, stretch, table_of
 from jumper_warp.robot.folder import SCHEMA as ROBOT_SCHEMA
@@ -25,48 +27,28 @@ from jumper_warp.utils.checks import check_type, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_json, write_atomically
 
-
-class Range(NamedTuple):
-    """Closed interval [low, high] of values that are plausible for a quantity."""
-
-    low: float  # in the unit
-    high: float  # in the unit
-    unit: str  # for messages; "" if dimensionless
-
-
-LINK_MASS = Range(1.0e-3, 100.0, "kg")  # From a bracket to the trunk of a robot that carries a person
-PLACE = Range(-2.0, 2.0, "m")  # Coordinate of a point in its link's frame; no leg is longer
-MOTOR_SPEED = Range(0.1, 1.0e3, "rad/s")  # At the output of the gear; 1000 rad/s are 9500 rpm
-ARMATURE = Range(1.0e-6, 1.0, "kg m^2")  # At the gear's output; 1 kg m^2 is ten times the inertia of a stretched leg
-MOTOR_FRICTION = Range(0.0, 10.0, "N m")
-KNEE_DAMPING = Range(1.0e-6, 10.0, "N m s/rad")
-SPRING_STIFFNESS = Range(0.0, 1.0e4, "N/m")
-"""Upper end: ten times the authors' springs; they swing at a third of the highest stable frequency at 1/480 s."""
-SPRING_LENGTH = Range(0.0, 1.0, "m")
-
-
 SCHEMA = "jumper-warp robot overlay 1"
 ROBOTS = ASSETS / "robots"  # Folder of the project's robots beside the Jumper, found by their names
 RATIO = Range(0.05, 3.0, "times the described value")
 RANGES = {
-    "base_mass": LINK_MASS,
-    "base_com": PLACE,
+    "base_mass": bounds.LINK_MASS,
+    "base_com": bounds.PLACE,
     "base_inertia": RATIO,
     "link_mass": RATIO,
-    "armature": ARMATURE,
-    "motor_friction": MOTOR_FRICTION,
+    "armature": bounds.ARMATURE,
+    "motor_friction": bounds.MOTOR_FRICTION,
     "kp": RATIO,
     "kd": RATIO,
     "saturation": RATIO,
     "peak": RATIO,
-    "no_load_speed": MOTOR_SPEED,
-    "cutoff_speed": MOTOR_SPEED,
+    "no_load_speed": bounds.MOTOR_SPEED,
+    "cutoff_speed": bounds.MOTOR_SPEED,
     "offset": Range(-0.5, 0.5, "rad"),
-    "knee_damping": KNEE_DAMPING,
+    "knee_damping": bounds.KNEE_DAMPING,
     "paw_friction": Range(0.0, 10.0, ""),
     "latency": Range(0.0, 0.1, "s"),
-    "spring_stiffness": SPRING_STIFFNESS,
-    "spring_length": SPRING_LENGTH,
+    "spring_stiffness": bounds.SPRING_STIFFNESS,
+    "spring_length": bounds.SPRING_LENGTH,
 }
 """Allowed values by field of `RobotValues`."""
 LENGTHS = {"thigh_length": ("thigh",), "shank_length": ("outer_shank", "inner_shank")}
@@ -75,14 +57,14 @@ SECTIONS = ("schema", "source", "robot", "values", "randomization")
 RANDOMIZED = {
     "static_friction": RANGES["paw_friction"],
     "dynamic_friction": RANGES["paw_friction"],
-    "base_mass": Range(-LINK_MASS.high, LINK_MASS.high, "kg"),
+    "base_mass": Range(-bounds.LINK_MASS.high, bounds.LINK_MASS.high, "kg"),
     "link_mass": Range(0.0, 10.0, ""),
-    "com_shift": PLACE,
+    "com_shift": bounds.PLACE,
     "gains": Range(0.0, 10.0, ""),
     "damping_gains": Range(0.0, 10.0, ""),
     "no_load_speed": Range(0.0, 10.0, ""),
     "cutoff_speed": Range(0.0, 10.0, ""),
-    "motor_friction": MOTOR_FRICTION,
+    "motor_friction": bounds.MOTOR_FRICTION,
     "armature": Range(0.0, 10.0, ""),
     "joint_offset": Range(-30.0, 30.0, "deg"),
     "latency": Range(0.0, 100.0, "ms"),

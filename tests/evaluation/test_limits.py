@@ -9,7 +9,7 @@ import torch
 from jump_helpers import make_env
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.sweeps import open_loop_limits
+from jumper_warp.evaluation.limits import open_loop_limits
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.apex import EXTEND, HOLD, RAMP

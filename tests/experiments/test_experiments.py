@@ -17,8 +17,9 @@ from experiments import (
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import run_evaluation, within
-from jumper_warp.evaluation.sweeps import HeightSweep, limit_metrics
+from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy

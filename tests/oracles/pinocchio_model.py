@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
-from jumper_warp.robot.export import urdf
+from jumper_warp.robot.urdf_writer import urdf
 from jumper_warp.robot.values import RobotValues, described
 from jumper_warp.utils.errors import InputError
 
