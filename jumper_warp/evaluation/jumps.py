@@ -212,7 +212,10 @@ class JumpLog(EvaluationLog):
         fits = goals.ndim == 3 and goals.shape[2] in (2, 3)
         check(fits, f"goals must have shape (num_envs,) or (num_envs, jumps, 2 or 3), got {goals.shape}")
         self.goals = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2])))
-        self.terminations, self.headings, self.delay, self.rest = terminations, headings, delay, rest
+        self.terminations = terminations
+        self.headings = headings
+        self.delay = delay
+        self.rest = rest
         self.to_heights = bool((self.goals[..., 2] > 0.0).all())  # whether all goals are apex heights
         places = ("goal_x_m", "goal_y_m", "distance_at_rest_m", "apex_m")
         heights = ("goal_height_m", "apex_m", "apex_error_m")

@@ -8,14 +8,9 @@ import torch
 
 from jumper_warp.cli.main import main
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
-from jumper_warp.evaluation.finetuning import (
-    ballistic_landing,
-    finetune,
-    jump_errors,
-    make_groups,
-    shift_goal_observation,
-)
+from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
+from jumper_warp.evaluation.jump_errors import ballistic_landing, jump_errors
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
