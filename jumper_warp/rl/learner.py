@@ -6,7 +6,6 @@ an iteration. The learner in `jumper_warp.rl.torch` calls PyTorch, that in `jump
 
 from __future__ import annotations
 
-import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -21,23 +20,8 @@ from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.samples import Batch
+from jumper_warp.utils.allocator import keep_freed_memory
 from jumper_warp.utils.errors import InputError
-
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # Options of glibc's mallopt (malloc.h)
-MAX_FREE, MAX_HEAP_BLOCK = 1 << 30, 32 << 20
-"""[B] Free memory kept at the top of the heap, and the largest block allocated from the heap (glibc's maximum)."""
-
-
-def keep_freed_memory() -> bool:
-    """Configure glibc to keep up to 1 GiB of this process's freed memory; return whether glibc accepted the settings.
-
-    With glibc's defaults every temporary array of a minibatch may cost one page fault per page.
-    """
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # not glibc
-        return False
-    return mallopt(TRIM_THRESHOLD, MAX_FREE) == 1 and mallopt(MMAP_THRESHOLD, MAX_HEAP_BLOCK) == 1
 
 
 class StepStatistics(NamedTuple):

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-import statistics
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from pathlib import Path
 from typing import Protocol
 
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl import distributed, resume
+from jumper_warp.rl import distributed, resume, seeds
 from jumper_warp.rl.actor_init import ActorInit
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import Checkpoint
@@ -25,7 +21,6 @@ from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
-from jumper_warp.utils.metrics import mean
 from jumper_warp.utils.runtime import DeviceStream
 from jumper_warp.utils.threads import set_threads
 
@@ -80,7 +75,7 @@ def train(
         cleanup.enter_context(console)
         trainings, folder, each = [(cfg, checkpoints[0] if checkpoints else None)], None, rank
         if cfg.seeds:
-            trainings = trainings_of(cfg, checkpoints)
+            trainings = seeds.trainings(cfg, checkpoints)
             folder = checkpoints[0].path.parents[2] if checkpoints else new_folder(cfg, rank)
             leave_process_group()
             each = Rank(0, 1, rank.device)
@@ -113,9 +108,9 @@ def train(
             results = {run.cfg.seed: run.result() for run in runs}
             hint = f", continue with: {runs[0].resume_command}" if stop.requested else ""
             console.print_line(f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}")
-            for line in seed_table(results, cfg.best_metric):
+            for line in seeds.table(results, cfg.best_metric):
                 console.print_line(line)
-            result = total_of(folder, results)
+            result = seeds.total(folder, results)
             failing = runs if rank.size == 1 else []  # an exit status of 1 would end the processes of the other seeds
         if failing and all(run.failure for run in failing):
             raise SystemExit(f"jumper: {failing[0].failure}")  # printed by Python, which exits with status 1
@@ -161,40 +156,3 @@ def leave_process_group() -> None:
     """Leave torch's process group, if this process is in one."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
-
-
-def trainings_of(cfg: TrainCfg, checkpoints: Sequence[Checkpoint]) -> list[tuple[TrainCfg, Checkpoint | None]]:
-    """Return the settings of each seed to train, with its checkpoint; if any has one, seeds without one are left out.
-
-    Raises InputError: a seed is not in cfg.seeds, or the checkpoints are of a single training.
-    """
-    names = [checkpoint.path.parents[1].name for checkpoint in checkpoints]
-    found = [int(name.removeprefix(SEED)) for name in names if name.startswith(SEED)]
-    if len(found) < len(names) or not set(found) <= set(cfg.seeds):
-        run = f"seeds {', '.join(map(str, sorted(found)))}" if found else "one seed"
-        raise InputError(f"the run to continue has {run}, got seeds {', '.join(map(str, cfg.seeds))}")
-    pairs = zip(found, checkpoints, strict=True) if found else ((seed, None) for seed in cfg.seeds)
-    return [(dataclasses.replace(cfg, seed=seed, seeds=()), checkpoint) for seed, checkpoint in pairs]
-
-
-def total_of(folder: Path, results: dict[int, TrainResult]) -> TrainResult:
-    """Return the result of all seeds: the largest iteration and time, and the means of the metrics that all have."""
-    values = list(results.values())
-    names = sorted(set.intersection(*(set(result.metrics) for result in values)))
-    means = {name: statistics.fmean(result.metrics[name] for result in values) for name in names}
-    return TrainResult(folder, max(r.iteration for r in values), max(r.seconds for r in values), means, results)
-
-
-def seed_table(results: dict[int, TrainResult], metric: str) -> list[str]:
-    """Return lines with the last value of a metric and the mean reward of each seed, and their means over the seeds.
-
-    In brackets: 95 % bootstrap interval of the mean.
-    """
-    lines = [f"seed   {metric.removeprefix('Metrics/'):>10}   reward   iteration"]
-    for seed, result in results.items():
-        numbers = (result.metrics.get(name, float("nan")) for name in (metric, "Train/mean_reward"))
-        lines.append("{:<6} {:>10.3f} {:>8.2f} {:>11}".format(seed, *numbers, result.iteration))
-    measured = mean([result.metrics.get(metric, math.nan) for result in results.values()])
-    if len(results) > 1 and measured.interval is not None:
-        lines.append("mean   {:>10.3f} [{:.3f}, {:.3f}]".format(measured.value, *measured.interval))
-    return lines
