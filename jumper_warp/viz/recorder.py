@@ -160,11 +160,20 @@ class Recorder:
         series = np.stack(self._series[first:], axis=1)
         points, forces = (np.stack(part) for part in zip(*self._contacts[first:], strict=True))
         return Recording(
-            np.array(self._times[first:]), self._worlds, self._names, np.stack(self._poses[first:]),
-            dict(zip(self._names_of_series, series, strict=True)), points, forces, self._spacing, self._shapes,
-            self._notes, self._labels,
-            {name: [frame[name] for frame in self._states[first:]] for name in self._states[0]}, **marks,
-        )  # fmt: skip
+            times=np.array(self._times[first:]),
+            worlds=self._worlds,
+            bodies=self._names,
+            poses=np.stack(self._poses[first:]),
+            series=dict(zip(self._names_of_series, series, strict=True)),
+            contact_points=points,
+            contact_forces=forces,
+            spacing=self._spacing,
+            shapes=self._shapes,
+            notes=self._notes,
+            labels=self._labels,
+            states={name: [frame[name] for frame in self._states[first:]] for name in self._states[0]},
+            **marks,
+        )
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording so far as a NumPy archive, which `load_npz` reads; return its path."""

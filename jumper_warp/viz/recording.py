@@ -21,7 +21,7 @@ from jumper_warp.viz.shapes import ShapeMesh, packed_shapes, unpacked_shapes
 FORMAT = "jumper-warp recording"
 VERSION = 2
 ARRAYS = "times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands"  # fields of `Recording`
-HEADER = "worlds", "bodies", "labels", "spacing", "notes", "states"  # fields of `Recording` in the header as they are
+HEADER = "worlds", "bodies", "labels", "spacing", "notes", "states"  # fields of `Recording` that the header contains
 MOTION = "motion/"  # Begin of the names of the file's arrays that `Recording.motion` holds
 FARTHEST = 1.0e6  # [m] Largest coordinate of a body in the first frame of a file, and largest spacing
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
