@@ -11,7 +11,8 @@ from platform import platform
 from types import ModuleType
 from typing import Any
 
-from jumper_warp.cli.main import FAULT, parse
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import FAULT
 
 TASK = "vertical-jump"  # Task of the environment that is stepped
 WORLDS = 64  # Worlds of the environment

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from jumper_warp.cli.flags import parse as parse_flags
 from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
-from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.utils.errors import suggestion
 from jumper_warp.utils.files import read_json
 

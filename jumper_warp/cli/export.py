@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:

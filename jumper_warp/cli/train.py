@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.flags import option_of, switch_of, values_of, wants_help
-from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
+from jumper_warp.cli.flags import option_of, parse, switch_of, values_of, wants_help
+from jumper_warp.cli.main import TASK_MODULE, UsageError
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
