@@ -26,10 +26,9 @@ import torch
 import tyro
 
 from jumper_warp.evaluation.attitude import AttitudeFlags
-from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.jump_metrics import JumpFlags
-from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.run import EvaluateCfg, EvaluationRun, evaluate
 from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import policy_tasks

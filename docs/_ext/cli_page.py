@@ -32,8 +32,9 @@ from jumper_warp.cli.try_task import TryCfg
 from jumper_warp.cli.watch import WatchArgs
 from jumper_warp.deploy.main import parser as deploy_parser
 from jumper_warp.evaluation.agents import AgentCfg
-from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
+from jumper_warp.evaluation.commands import DumpCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
+from jumper_warp.evaluation.run import EvaluateCfg
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.evaluation import EpisodeEvaluation

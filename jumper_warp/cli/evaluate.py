@@ -51,7 +51,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     if SUITE in args:
         run_suite(run.task, args, modules)
         return
-    from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
+    from jumper_warp.evaluation.run import EvaluateCfg, evaluate
 
     check_suite_flags(run.task, args)
     evaluate(run, parse("evaluate", run.task, args, EvaluateCfg))
@@ -59,8 +59,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def check_suite_flags(task: TaskCfg, args: Sequence[str]) -> None:
     """Raise UsageError if args, without --suite, have a flag that only test suites of the task's policies have."""
-    from jumper_warp.evaluation.commands import EvaluateCfg
     from jumper_warp.evaluation.conditions import Conditions
+    from jumper_warp.evaluation.run import EvaluateCfg
     from jumper_warp.evaluation.suites import suites_for
     from jumper_warp.utils.summary import PrintFlags
 
