@@ -113,8 +113,7 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
     session = {name: values[0] for name, values in flags.items() if values}
     if "resume" not in session:
         return recipe, []
-    from jumper_warp.rl.checkpoint import CheckpointError
-    from jumper_warp.rl.resume import find_checkpoints
+    from jumper_warp.rl.checkpoint import CheckpointError, find_checkpoints
     from jumper_warp.rl.run_names import seed_folders
 
     checkpoints = find_checkpoints(dataclasses.replace(recipe.train, **session))

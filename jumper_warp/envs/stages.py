@@ -117,16 +117,6 @@ class Stages(Uncopied):
             (make_handover_kernel(h), self.tasks.index(h.source), self.tasks.index(h.target)) for h in handovers
         ]
 
-    def after_load_state(self) -> None:
-        """Update the flag `_started`, term parameters and solver after `load_state` wrote the environment's arrays.
-
-        Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
-        """
-        self._started = bool((self.episodes.step_count.numpy() > arrays.FIRST_STEP_COUNT).all())
-        for skill in self.skills:
-            skill.params.restore()
-        self.sim.dynamics.parameters_changed()
-
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return the kernels of `step`, and of `reset` if draws, else `evaluation_reset`, each with its block size."""
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
