@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs import arrays
 from jumper_warp.envs.gradients import EnvGradients
-from jumper_warp.envs.stages import STAGES, Stages, usual_kernels
+from jumper_warp.envs.skill import kernels_of
+from jumper_warp.envs.stages import STAGES, Stages, with_blocks
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
@@ -130,7 +131,8 @@ class Env(Stages):
         init_warp()
         self.wp_device = wp.get_device(None if device is None else str(device))
         physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
-        with loading_kernels([*physics, *usual_kernels(run, auto_reset)], self.wp_device):
+        by_task = [kernels_of(each) for each in run]
+        with loading_kernels([*physics, *with_blocks(by_task, auto_reset)], self.wp_device):
             self.sim = Simulation(
                 num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
                 block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,

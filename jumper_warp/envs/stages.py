@@ -15,7 +15,7 @@ import warp as wp
 
 from jumper_warp.envs import arrays
 from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import TaskRuntime, kernels_of
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
@@ -41,14 +41,13 @@ EVENT_BLOCKS = 264
 """Largest number of blocks of event kernels. Most threads are idle, and a new block costs more than another pass."""
 
 
-def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, int]]:
-    """Return the kernels that any environment of given tasks launches, with block sizes; the slowest compile first.
+def with_blocks(by_task: Sequence[dict[str, Kernel]], draws: bool) -> list[tuple[Kernel, int]]:
+    """Return the kernels that any environment launches, with block sizes; the slowest compile first.
 
-    draws: include those of `reset`, else those of `evaluation_reset`.
+    by_task: kernels of each task, see `kernels_of`. draws: include those of `reset`, else those of `evaluation_reset`.
     """
     names = ("reset" if draws else "set_command", "step", "observe", "event")
     shared = [track_kernel, action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel]
-    by_task = [kernels_of(task) for task in tasks]
     kernels = [(kernels[name], BLOCKS.get(name, BLOCK)) for name in names for kernels in by_task]
     return [*kernels, *((kernel, BLOCK) for kernel in shared), (postprocess_obs_kernel, POSTPROCESS_BLOCK)]
 
@@ -122,7 +121,7 @@ class Stages(Uncopied):
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
-        kernels = usual_kernels([skill.task for skill in self.skills], draws)
+        kernels = with_blocks([skill.kernels for skill in self.skills], draws)
         return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.dynamics.step_kernels()]
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
