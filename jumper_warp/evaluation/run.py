@@ -248,7 +248,7 @@ class EvaluationRun(Run):
         """Load a policy; call `prepare` before any other method.
 
         source: name or folder of a policy, a run's folder, or a checkpoint; modules: the user's task modules.
-        Raises PolicyError or CheckpointError.
+        Raises PolicyError, TaskError or CheckpointError.
         """
         super().__init__()
         self.source = source
@@ -291,7 +291,7 @@ class EvaluationRun(Run):
         conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:
-        """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_recipe`.
+        """Return an environment of the policy's task with `count` worlds. Raises TaskError, see `env_of_recipe`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
@@ -382,15 +382,12 @@ class SkillRun(Run):
         """Return an environment of `count` robots that start with WALK, and move the policies to its device.
 
         The robot has the overlay (changed parameters) of the policies' training. scene: further arguments of `Env`,
-        e.g. `block`. Raises PolicyError: policies were trained with different overlays, or the tasks do not fit.
+        e.g. `block`. Raises PolicyError: the policies have different overlays; InputError: the tasks do not fit.
         """
         from jumper_warp.envs.env import Env
 
         walk, *jumps = (self.conditions.applied(task) for task in self.tasks)
-        try:
-            self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
-        except InputError as error:
-            raise PolicyError(str(error)) from error
+        self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
         robots = {name: recipe.robot for name, recipe in zip(self.names, self.recipes, strict=True)}
         settings = self.conditions.env_settings(shared_robot(robots, self.conditions))
         env = Env(self.skills, count, skill=WALK, handovers=handovers, **settings, **scene)
