@@ -110,7 +110,8 @@ class Conditions:
 
         With fixed parameters and no randomisation it is on level ground, without the task's events.
         """
-        task = (task if self.gravity is None else replace(task, gravity=self.gravity)).without_margins()
+        gravity = task.gravity if self.gravity is None else self.gravity
+        task = replace(task, gravity=gravity, self_collision_margin=0.0, obstacle_margin=0.0)
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
