@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs import arrays
 from jumper_warp.envs.gradients import EnvGradients
-from jumper_warp.envs.skill import kernels_of
+from jumper_warp.envs.skill import TaskRuntime, kernels_of
 from jumper_warp.envs.stages import STAGES, Stages, with_blocks
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
@@ -154,7 +154,9 @@ class Env(Stages):
         self.step_hooks: list[Callable[[], None]] = []
         """Functions that `step` calls last, also within a captured graph; they must not change the environment."""
         self.gradients_of_step: EnvGradients | None = None
-        self._allocate(run, skill, handovers, moves_of(self.overlay))
+        sizes = (num_envs, self.step_dt, self.sim.substeps, self.wp_device, len(self.sim.slices))
+        self.skills = [TaskRuntime(each, i, *sizes) for i, each in enumerate(run)]
+        self._allocate(skill, handovers, moves_of(self.overlay))
         self._show()
 
     def _show(self) -> None:

@@ -73,6 +73,7 @@ class Stages(Uncopied):
 
     sim: Simulation
     tasks: tuple[TaskCfg, ...]
+    skills: list[TaskRuntime]
     num_envs: int
     seed: int
     stream: Purpose
@@ -83,23 +84,19 @@ class Stages(Uncopied):
     _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
-    def _allocate(
-        self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves
-    ) -> None:
-        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one.
+    def _allocate(self, skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves) -> None:
+        """Allocate the arrays that all tasks share; skill: index of each world's first task, (num_envs,) or one.
 
         moves: differences of the robot from the described one.
         """
         n = self.num_envs
+        tasks = tuple(each.task for each in self.skills)
         device = self.wp_device
         sim = self.sim
         wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
         self._first_skill = arrays.checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
-        self.skills = [
-            TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
-        ]
-        self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
+        self.parameters = robot_parameters(sim, tasks, active, moves)
         self.robot = arrays.robot_arrays(sim, self.step_dt)
         self._scene = arrays.scene_of(sim)
         self.episodes = arrays.episode_arrays(n, self.seed, self.stream, active, device)
