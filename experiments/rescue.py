@@ -42,7 +42,7 @@ from jumper_warp.viz.pairs import side_by_side
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.recording import Recording
 from measure_policies import payload_overlay
-from support.own_motion import Record, RobotChange, identify, recorder_of, write_changes
+from support.own_motion import MEASURED, NOISE, Record, RobotChange, identify, measured, recorder_of, write_changes
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
 
 WEAK_MOTOR = RobotOverlay({"saturation": (1.0, 1.0, 0.5, *(9 * (1.0,)))})  # Left front inner motor
@@ -84,6 +84,7 @@ class Args(ThreadArgs):
     seed: int = 1  # Seed of the goals; the controller was tuned with seed 0
     processes: int = 1  # Number of processes that share the robots
     batch: int = 8  # Number of robots that a process simulates at once
+    noise: bool = False  # Identify from a motion that is measured with the noise of the policy's observation
     film: bool = False  # Film a saved robot of each change beside the same robot with the policy
 
 
@@ -176,7 +177,12 @@ class Robots:
         if mode != "policy":
             assumed = self.env(len(goals), changed=mode != "identified")
             if mode == "identified":
-                found = identify(self.record(goals), assumed)
+                record = self.record(goals)
+                if self.args.noise:
+                    noise = np.hypot(NOISE, 2.0 * MEASURED)
+                    found = identify(measured(record, np.random.default_rng(self.args.seed)), assumed, noise)
+                else:
+                    found = identify(record, assumed)
                 write_changes(assumed, found)
             act = self.controller(env, assumed).act
         log = self.log(env, goals)

@@ -7,7 +7,7 @@ the recorded one by Gauss-Newton, with finite differences: all windows and robot
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -18,12 +18,19 @@ from jumper_warp.envs.env import Env
 from jumper_warp.kernels.layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
+from jumper_warp.tasks.observations import POSITION_NOISE, ROBOT
+from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 WINDOW = 3  # Policy steps of a simulation
 WINDOWS = 60  # Number of windows of each robot, from the first steps of its motion at most
 PRIOR = np.array([3.0, 0.7, 3.0, *(12 * (0.4,))])  # Standard deviations: kg, ln, m/s^2, ln
 NOISE = np.repeat([0.002, 0.005, 0.005, 0.03, 0.1, 0.3], [3, 4, 12, 3, 3, 12])[:, None]
 """Standard deviations of errors that count as noise: position [m], quaternion, motor angles [rad], and their rates."""
+OBSERVED = {term.name: term.numbers["noise"] for term in ROBOT}  # Noise of the policy's observation by term
+MEASURED = np.repeat(
+    [POSITION_NOISE, 0.5 * OBSERVED["gravity"], *(OBSERVED[name] for name in ("angle", "lin_vel", "ang_vel", "rate"))],
+    [3, 4, 12, 3, 3, 12],
+)[:, None]  # Standard deviations of measured states, in the order of NOISE
 OUTLIER = 3.0  # Error over the noise from which an error counts linearly: contacts that begin at another time
 ITERATIONS = 5
 DIFFERENCE = 1.0e-2  # Of a parameter, in standard deviations of its prior
@@ -77,6 +84,17 @@ def recorder_of(env: Env, act: Callable) -> tuple[Record, Callable]:
     return record, acting
 
 
+def measured(record: Record, rng: np.random.Generator) -> Record:
+    """Return a copy of a record whose states have the noise of the policy's observation."""
+    q, qd = [], []
+    for row, rates in zip(record.q, record.qd, strict=True):
+        noise = MEASURED * rng.standard_normal((len(MEASURED), row.shape[1]))
+        turned = multiply(from_rotation_vector(2.0 * noise[3:6].T), row[3:7].T).T
+        q.append(np.concatenate([row[:3] + noise[:3], turned, row[7:] + noise[7:19]]))
+        qd.append(rates + noise[19:])
+    return replace(record, q=q, qd=qd)
+
+
 def changed_columns(table: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Return the columns of a parameter table (rows, n) with changes theta (15, n) of robots."""
     changed = table.copy()
@@ -96,8 +114,11 @@ def write_changes(env: Env, change: RobotChange) -> None:
     saturation.mul_(torch.as_tensor(np.exp(change.theta[3:]), dtype=saturation.dtype))
 
 
-def identify(record: Record, nominal: Env) -> RobotChange:
-    """Return the changes of the recorded robots from the nominal ones of an environment of as many robots."""
+def identify(record: Record, nominal: Env, noise: np.ndarray = NOISE) -> RobotChange:
+    """Return the changes of the recorded robots from the nominal ones of an environment of as many robots.
+
+    noise: (37, 1) standard deviations of errors, in the order of NOISE.
+    """
     robots = nominal.snapshot()
     n = nominal.num_envs
     steps = len(record.q) - WINDOW
@@ -125,7 +146,7 @@ def identify(record: Record, nominal: Env) -> RobotChange:
         rollout.parameters["saturation"].assign((saturation * np.exp(wide[3:])).astype(np.float32))
         motion = rollout.run(targets, q, qd, initial_target=initial_target)
         found = np.concatenate([motion.q.numpy()[-1], motion.qd.numpy()[-1]])
-        error = np.nan_to_num((found - ends) / NOISE) * counts
+        error = np.nan_to_num((found - ends) / noise) * counts
         return error.reshape(len(error), n, len(first))
 
     theta = np.zeros((len(PRIOR), n))
