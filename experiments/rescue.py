@@ -42,7 +42,16 @@ from jumper_warp.viz.pairs import side_by_side
 from jumper_warp.viz.plots import figure
 from jumper_warp.viz.recording import Recording
 from measure_policies import payload_overlay
-from support.own_motion import MEASURED, NOISE, Record, RobotChange, identify, measured, recorder_of, write_changes
+from support.own_motion import (
+    MEASURED_NOISE,
+    NOISE,
+    Record,
+    RobotChange,
+    identify,
+    measured,
+    recorder_of,
+    write_changes,
+)
 from support.scripts import ThreadArgs, announce, prepare, report, run_script
 
 WEAK_MOTOR = RobotOverlay({"saturation": (1.0, 1.0, 0.5, *(9 * (1.0,)))})  # Left front inner motor
@@ -178,11 +187,10 @@ class Robots:
             assumed = self.env(len(goals), changed=mode != "identified")
             if mode == "identified":
                 record = self.record(goals)
+                noise = NOISE
                 if self.args.noise:
-                    noise = np.hypot(NOISE, 2.0 * MEASURED)
-                    found = identify(measured(record, np.random.default_rng(self.args.seed)), assumed, noise)
-                else:
-                    found = identify(record, assumed)
+                    record, noise = measured(record, np.random.default_rng(self.args.seed)), MEASURED_NOISE
+                found = identify(record, assumed, noise)
                 write_changes(assumed, found)
             act = self.controller(env, assumed).act
         log = self.log(env, goals)

@@ -17,7 +17,8 @@ from jumper_warp.diff.rollout import Rollout
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import build_model
+from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.tasks.observations import POSITION_NOISE, ROBOT
 from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
@@ -30,7 +31,9 @@ OBSERVED = {term.name: term.numbers["noise"] for term in ROBOT}  # Noise of the 
 MEASURED = np.repeat(
     [POSITION_NOISE, 0.5 * OBSERVED["gravity"], *(OBSERVED[name] for name in ("angle", "lin_vel", "ang_vel", "rate"))],
     [3, 4, 12, 3, 3, 12],
-)[:, None]  # Standard deviations of measured states, in the order of NOISE
+)[:, None]  # Standard deviations of the noise of measured states, in the order of NOISE
+MEASURED_NOISE = np.hypot(NOISE, MEASURED * np.repeat([0.3, 0.5, 1.0], [19, 6, 12])[:, None])  # after `measured`
+NEAR, NEXT = 8, 1  # Policy steps before and after a step over which positions, and velocities, are averaged
 OUTLIER = 3.0  # Error over the noise from which an error counts linearly: contacts that begin at another time
 ITERATIONS = 5
 DIFFERENCE = 1.0e-2  # Of a parameter, in standard deviations of its prior
@@ -84,15 +87,29 @@ def recorder_of(env: Env, act: Callable) -> tuple[Record, Callable]:
     return record, acting
 
 
+def averaged(values: np.ndarray, moved: np.ndarray, near: int) -> np.ndarray:
+    """Return values (steps, ...) averaged over `near` steps before and after; moved: their motion since the start."""
+    still = values - moved
+    return moved + np.stack([still[max(0, i - near) : i + near + 1].mean(0) for i in range(len(still))])
+
+
 def measured(record: Record, rng: np.random.Generator) -> Record:
-    """Return a copy of a record whose states have the noise of the policy's observation."""
-    q, qd = [], []
-    for row, rates in zip(record.q, record.qd, strict=True):
-        noise = MEASURED * rng.standard_normal((len(MEASURED), row.shape[1]))
-        turned = multiply(from_rotation_vector(2.0 * noise[3:6].T), row[3:7].T).T
-        q.append(np.concatenate([row[:3] + noise[:3], turned, row[7:] + noise[7:19]]))
-        qd.append(rates + noise[19:])
-    return replace(record, q=q, qd=qd)
+    """Return a copy of a record whose states have the noise of the policy's observation, and are smoothed.
+
+    Measured velocities tell how positions and angles move between policy steps, so these can be averaged.
+    """
+    q, qd = np.array(record.q), np.array(record.qd)
+    noise = MEASURED * rng.standard_normal((len(q), len(MEASURED), q.shape[2]))
+    q[:, 3:7] = multiply(from_rotation_vector(2.0 * noise[:, 3:6].mT), q[:, 3:7].mT).mT
+    q[:, :3] += noise[:, :3]
+    q[:, 7:] += noise[:, 7:19]
+    qd += noise[:, 19:]
+    spin = np.pad(qd[:, 3:6], ((0, 0), (0, 1), (0, 0)))
+    rates = np.concatenate([qd[:, :3], 0.5 * multiply(spin.mT, q[:, 3:7].mT).mT, qd[:, 6:]], axis=1)
+    q = averaged(q, PHYSICS_DT * SUBSTEPS * (np.cumsum(rates, 0) - 0.5 * rates), NEAR)
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    qd[:, :6] = averaged(qd[:, :6], np.zeros_like(qd[:, :6]), NEXT)
+    return replace(record, q=list(q), qd=list(qd))
 
 
 def changed_columns(table: np.ndarray, theta: np.ndarray) -> np.ndarray:
