@@ -19,7 +19,6 @@ from jumper_warp.kernels.layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_S
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.sim.simulation import SUBSTEPS
-from jumper_warp.tasks.observations import POSITION_NOISE, ROBOT
 from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 WINDOW = 3  # Policy steps of a simulation
@@ -27,13 +26,9 @@ WINDOWS = 60  # Number of windows of each robot, from the first steps of its mot
 PRIOR = np.array([3.0, 0.7, 3.0, *(12 * (0.4,))])  # Standard deviations: kg, ln, m/s^2, ln
 NOISE = np.repeat([0.002, 0.005, 0.005, 0.03, 0.1, 0.3], [3, 4, 12, 3, 3, 12])[:, None]
 """Standard deviations of errors that count as noise: position [m], quaternion, motor angles [rad], and their rates."""
-OBSERVED = {term.name: term.numbers["noise"] for term in ROBOT}  # Noise of the policy's observation by term
-MEASURED = np.repeat(
-    [POSITION_NOISE, 0.5 * OBSERVED["gravity"], *(OBSERVED[name] for name in ("angle", "lin_vel", "ang_vel", "rate"))],
-    [3, 4, 12, 3, 3, 12],
-)[:, None]  # Standard deviations of the noise of measured states, in the order of NOISE
+MEASURED = np.repeat([0.005, 0.025, 0.052, 0.1, 0.1, 0.175], [3, 4, 12, 3, 3, 12])[:, None]
+"""Standard deviations of the noise of measured states, as in `jumper_warp.tasks.observations`."""
 MEASURED_NOISE = np.hypot(NOISE, MEASURED * np.repeat([0.3, 0.5, 1.0], [19, 6, 12])[:, None])  # after `measured`
-NEAR, NEXT = 8, 1  # Policy steps before and after a step over which positions, and velocities, are averaged
 OUTLIER = 3.0  # Error over the noise from which an error counts linearly: contacts that begin at another time
 ITERATIONS = 5
 DIFFERENCE = 1.0e-2  # Of a parameter, in standard deviations of its prior
@@ -100,15 +95,14 @@ def measured(record: Record, rng: np.random.Generator) -> Record:
     """
     q, qd = np.array(record.q), np.array(record.qd)
     noise = MEASURED * rng.standard_normal((len(q), len(MEASURED), q.shape[2]))
-    q[:, 3:7] = multiply(from_rotation_vector(2.0 * noise[:, 3:6].mT), q[:, 3:7].mT).mT
-    q[:, :3] += noise[:, :3]
-    q[:, 7:] += noise[:, 7:19]
+    turned = multiply(from_rotation_vector(2.0 * noise[:, 3:6].mT), q[:, 3:7].mT).mT
+    q = np.concatenate([q[:, :3] + noise[:, :3], turned, q[:, 7:] + noise[:, 7:19]], axis=1)
     qd += noise[:, 19:]
     spin = np.pad(qd[:, 3:6], ((0, 0), (0, 1), (0, 0)))
     rates = np.concatenate([qd[:, :3], 0.5 * multiply(spin.mT, q[:, 3:7].mT).mT, qd[:, 6:]], axis=1)
-    q = averaged(q, PHYSICS_DT * SUBSTEPS * (np.cumsum(rates, 0) - 0.5 * rates), NEAR)
+    q = averaged(q, PHYSICS_DT * SUBSTEPS * (np.cumsum(rates, 0) - 0.5 * rates), 8)
     q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
-    qd[:, :6] = averaged(qd[:, :6], np.zeros_like(qd[:, :6]), NEXT)
+    qd[:, :6] = averaged(qd[:, :6], np.zeros_like(qd[:, :6]), 1)
     return replace(record, q=list(q), qd=list(qd))
 
 
@@ -131,11 +125,12 @@ def write_changes(env: Env, change: RobotChange) -> None:
     saturation.mul_(torch.as_tensor(np.exp(change.theta[3:]), dtype=saturation.dtype))
 
 
-def identify(record: Record, nominal: Env, noise: np.ndarray = NOISE) -> RobotChange:
+def identify(record: Record, nominal: Env, rng: np.random.Generator | None = None) -> RobotChange:
     """Return the changes of the recorded robots from the nominal ones of an environment of as many robots.
 
-    noise: (37, 1) standard deviations of errors, in the order of NOISE.
+    rng: of the noise with which the motion is measured (default: it is exact).
     """
+    record, noise = (record, NOISE) if rng is None else (measured(record, rng), MEASURED_NOISE)
     robots = nominal.snapshot()
     n = nominal.num_envs
     steps = len(record.q) - WINDOW
