@@ -78,7 +78,7 @@ def mars_standing_jump() -> TaskCfg:
     )  # fmt: skip
 
 
-register_task(NAME, mars_standing_jump, ppo=FROM_STANCE)
+register_task(NAME, mars_standing_jump, ppo=FROM_STANCE, replace=True)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def planned(args: Args) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def imitate(args: Args, obs: torch.Tensor, actions: torch.Tensor, device: torch.device) -> tuple[Policy, float]:
-    """Return a policy that imitates samples (samples, ...), and the root mean squared error [1] of the last epoch."""
+    """Return a policy that imitates samples (samples, ...), and the root mean squared error [1] of its actions."""
     torch.manual_seed(args.seed)
     recipe = Recipe.of(NAME)
     ppo = recipe.train.ppo
@@ -144,17 +144,15 @@ def imitate(args: Args, obs: torch.Tensor, actions: torch.Tensor, device: torch.
     model.to(device)
     features, actions = model.features(obs.to(device)), actions.to(device)
     optimiser = torch.optim.Adam(model.actor.parameters())
-    total = torch.zeros((), device=device)
     for epoch in range(args.epochs):
         optimiser.param_groups[0]["lr"] = 1.0e-3 * (1.0 - epoch / args.epochs)
-        total.zero_()
         for batch in torch.randperm(len(features), device=device).split(BATCH):
             mean = model.mean(features[batch])
             error = (mean - actions[batch]) * (mean.clamp(-1.0, 1.0) != actions[batch])  # actions are clipped to ±1
             optimiser.zero_grad()
             error.square().mean().backward()
             optimiser.step()
-            total += error.detach().square().sum() / actions.numel()
+    rms = (model.mean(features).clamp(-1.0, 1.0) - actions).square().mean().sqrt().item()
     earth = Policy.load(args.policy)
     layers = expand_layers([(w.detach().cpu(), b.detach().cpu()) for w, b in linear_layers(model.actor)], symmetry)
     spec = make_interface(
@@ -162,7 +160,7 @@ def imitate(args: Args, obs: torch.Tensor, actions: torch.Tensor, device: torch.
         policy_dt=earth.interface.policy_dt, physics_dt=earth.interface.physics_dt,
         hidden=tuple(len(bias) for _, bias in layers[:-1]), activation=ppo.activation,
     )  # fmt: skip
-    return Policy(layers, init.mean, init.std, spec, recipe.to_json()), total.sqrt().item()
+    return Policy(layers, init.mean, init.std, spec, recipe.to_json()), rms
 
 
 def main(args: Args) -> dict:
