@@ -7,8 +7,8 @@ the script counts those that the controller saves: after long optimisations befo
 and with the simulation's own physics step (offline), with two iterations in every policy step and the changed robot as
 the assumed one (known), or a robot that is identified from the lost jump (identified). A robot that any of these saves
 is savable. The script also compares policy and controller on nominal robots, measures the time of a policy step, and
-writes `metrics.json`, the outcome of each robot (`outcomes.json`), `rescue.png` and, with `--film`, `rescue.webp`.
-Processes (`--processes`) share the robots, in batches of similar goals.
+writes `metrics.json`, the outcome of each robot (`outcomes.json`), `rescue.png` and, with `--film`, a film of each
+change. Processes (`--processes`) share the robots, in batches of similar goals.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ class Args(ThreadArgs):
     seed: int = 1  # Seed of the goals; the controller was tuned with seed 0
     processes: int = 1  # Number of processes that share the robots
     batch: int = 8  # Number of robots that a process simulates at once
+    noise: bool = False  # Identify from a motion that is measured with the noise of the policy's observation
     film: bool = False  # Film a saved robot of each change beside the same robot with the policy
 
 
@@ -176,7 +177,8 @@ class Robots:
         if mode != "policy":
             assumed = self.env(len(goals), changed=mode != "identified")
             if mode == "identified":
-                found = identify(self.record(goals), assumed)
+                rng = np.random.default_rng(self.args.seed) if self.args.noise else None
+                found = identify(self.record(goals), assumed, rng)
                 write_changes(assumed, found)
             act = self.controller(env, assumed).act
         log = self.log(env, goals)
@@ -278,16 +280,18 @@ def make_jobs(args: Args, values: dict[str, float]) -> list[Job]:
     return jobs
 
 
-def film_rescues(args: Args, jobs: list[Job], results: dict, path: Path) -> None:
+def film_rescues(args: Args, jobs: list[Job], results: dict, folder: Path) -> None:
     """Film a saved robot of each change, with the policy and with the controller that knows the change."""
-    recordings = {}
     for name in args.changes:
         goals = [job.goals for job in jobs if (job.name, job.mode) == (name, "known")]
         saved = np.concatenate(goals)[results[name, "known"][0]] if goals else np.zeros(0)
-        for mode in ("policy", "known") if len(saved) else ():
-            rescue = Robots(CHANGES[name], args).rescue(mode, saved[[len(saved) // 2]], film=True)
-            recordings[f"{name.replace('_', ' ')}, {mode}"] = rescue.recording
-    write_film(side_by_side({label: each for label, each in recordings.items() if each}), path)
+        recordings = {}
+        for mode, label in {"policy": f"{name.replace('_', ' ')}: policy", "known": "controller"}.items():
+            goal = saved[len(saved) // 2 :][:1]
+            if len(goal):
+                recordings[label] = Robots(CHANGES[name], args).rescue(mode, goal, film=True).recording
+        if recordings:
+            write_film(side_by_side(recordings), folder / f"rescue_{name}.webp", size=(480, 270), fps=15.0)
 
 
 def main(args: Args) -> dict:
@@ -317,7 +321,7 @@ def main(args: Args) -> dict:
         axis.set_ylabel("share of lost robots")
         axis.legend()
     if args.film:
-        film_rescues(args, jobs, results, folder / "rescue.webp")
+        film_rescues(args, jobs, results, folder)
     keys = [key for key in values if key.endswith(("saved_rate", "success_rate", "_ms"))]
     return report(args, folder, values, "Rescue of jumps", keys)
 

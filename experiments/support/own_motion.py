@@ -7,7 +7,7 @@ the recorded one by Gauss-Newton, with finite differences: all windows and robot
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -17,13 +17,18 @@ from jumper_warp.diff.rollout import Rollout
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import build_model
+from jumper_warp.robot.model import PHYSICS_DT, build_model
+from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 WINDOW = 3  # Policy steps of a simulation
 WINDOWS = 60  # Number of windows of each robot, from the first steps of its motion at most
 PRIOR = np.array([3.0, 0.7, 3.0, *(12 * (0.4,))])  # Standard deviations: kg, ln, m/s^2, ln
 NOISE = np.repeat([0.002, 0.005, 0.005, 0.03, 0.1, 0.3], [3, 4, 12, 3, 3, 12])[:, None]
 """Standard deviations of errors that count as noise: position [m], quaternion, motor angles [rad], and their rates."""
+MEASURED = np.repeat([0.005, 0.025, 0.052, 0.1, 0.1, 0.175], [3, 4, 12, 3, 3, 12])[:, None]
+"""Standard deviations of the noise of measured states, as in `jumper_warp.tasks.observations`."""
+MEASURED_NOISE = np.hypot(NOISE, MEASURED * np.repeat([0.3, 0.5, 1.0], [19, 6, 12])[:, None])  # after `measured`
 OUTLIER = 3.0  # Error over the noise from which an error counts linearly: contacts that begin at another time
 ITERATIONS = 5
 DIFFERENCE = 1.0e-2  # Of a parameter, in standard deviations of its prior
@@ -77,6 +82,30 @@ def recorder_of(env: Env, act: Callable) -> tuple[Record, Callable]:
     return record, acting
 
 
+def averaged(values: np.ndarray, moved: np.ndarray, near: int) -> np.ndarray:
+    """Return values (steps, ...) averaged over `near` steps before and after; moved: their motion since the start."""
+    still = values - moved
+    return moved + np.stack([still[max(0, i - near) : i + near + 1].mean(0) for i in range(len(still))])
+
+
+def measured(record: Record, rng: np.random.Generator) -> Record:
+    """Return a copy of a record whose states have the noise of the policy's observation, and are smoothed.
+
+    Measured velocities tell how positions and angles move between policy steps, so these can be averaged.
+    """
+    q, qd = np.array(record.q), np.array(record.qd)
+    noise = MEASURED * rng.standard_normal((len(q), len(MEASURED), q.shape[2]))
+    turned = multiply(from_rotation_vector(2.0 * noise[:, 3:6].mT), q[:, 3:7].mT).mT
+    q = np.concatenate([q[:, :3] + noise[:, :3], turned, q[:, 7:] + noise[:, 7:19]], axis=1)
+    qd += noise[:, 19:]
+    spin = np.pad(qd[:, 3:6], ((0, 0), (0, 1), (0, 0)))
+    rates = np.concatenate([qd[:, :3], 0.5 * multiply(spin.mT, q[:, 3:7].mT).mT, qd[:, 6:]], axis=1)
+    q = averaged(q, PHYSICS_DT * SUBSTEPS * (np.cumsum(rates, 0) - 0.5 * rates), 8)
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    qd[:, :6] = averaged(qd[:, :6], np.zeros_like(qd[:, :6]), 1)
+    return replace(record, q=list(q), qd=list(qd))
+
+
 def changed_columns(table: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Return the columns of a parameter table (rows, n) with changes theta (15, n) of robots."""
     changed = table.copy()
@@ -96,8 +125,12 @@ def write_changes(env: Env, change: RobotChange) -> None:
     saturation.mul_(torch.as_tensor(np.exp(change.theta[3:]), dtype=saturation.dtype))
 
 
-def identify(record: Record, nominal: Env) -> RobotChange:
-    """Return the changes of the recorded robots from the nominal ones of an environment of as many robots."""
+def identify(record: Record, nominal: Env, rng: np.random.Generator | None = None) -> RobotChange:
+    """Return the changes of the recorded robots from the nominal ones of an environment of as many robots.
+
+    rng: of the noise with which the motion is measured (default: it is exact).
+    """
+    record, noise = (record, NOISE) if rng is None else (measured(record, rng), MEASURED_NOISE)
     robots = nominal.snapshot()
     n = nominal.num_envs
     steps = len(record.q) - WINDOW
@@ -125,7 +158,7 @@ def identify(record: Record, nominal: Env) -> RobotChange:
         rollout.parameters["saturation"].assign((saturation * np.exp(wide[3:])).astype(np.float32))
         motion = rollout.run(targets, q, qd, initial_target=initial_target)
         found = np.concatenate([motion.q.numpy()[-1], motion.qd.numpy()[-1]])
-        error = np.nan_to_num((found - ends) / NOISE) * counts
+        error = np.nan_to_num((found - ends) / noise) * counts
         return error.reshape(len(error), n, len(first))
 
     theta = np.zeros((len(PRIOR), n))

@@ -46,13 +46,14 @@ class PredictiveController:
 
     def __init__(
         self, env: Env, policy: Policy, assumed: Env, *, iterations: int = 2, scales: Sequence[float] = SCALES,
-        substeps: int = SUBSTEPS, threads: int | None = None,
+        substeps: int = SUBSTEPS, threads: int | None = None, longest: int = LONGEST,
     ) -> None:  # fmt: skip
         """Prepare the control of the robots of `env`; plans begin at its next reset.
 
         assumed: environment of the robots as plans assume them, of the same task and num_envs. iterations: of the
         optimisation in a policy step. scales [1]: factors on the goal of the policy's jumps of which the best one is
         the first plan. substeps: physics steps of a plan in a policy step. threads: as in `Rollout`.
+        longest: policy steps of the longest plan.
         Raises InputError: the task is no jump, or has no SolverJumper.
         """
         robots = assumed.snapshot()
@@ -64,6 +65,7 @@ class PredictiveController:
         self.iterations = iterations
         self.first_iterations = 0
         self.scales = scales
+        self.longest = longest
         self.model = PlanModel(robots, np.zeros((3, env.num_envs)), substeps=substeps, threads=threads)
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
@@ -93,7 +95,7 @@ class PredictiveController:
         self.stands = np.zeros(self.env.num_envs, dtype=bool)
         self.cost = np.full(self.env.num_envs, np.inf)
         touchdown = np.zeros(self.env.num_envs, dtype=int)
-        actions = np.zeros((LONGEST, 12, self.env.num_envs))
+        actions = np.zeros((self.longest, 12, self.env.num_envs))
         for scale in self.scales:
             tried = self._policy_jump(arrays, scale)
             outlook = self.model.simulate(tried, self.start)
@@ -101,13 +103,13 @@ class PredictiveController:
             self.cost = np.where(better, outlook.cost, self.cost)
             touchdown = np.where(better, outlook.touchdown, touchdown)
             actions = np.where(better, tried, actions)
-        self.length = min(int(touchdown.max()) + SETTLED, LONGEST)
+        self.length = min(int(touchdown.max()) + SETTLED, self.longest)
         self.plan = Plan(np.pad(actions, ((0, SPARE), (0, 0), (0, 0)), mode="edge"))
         if self.first_iterations:
             self.plan.explore(self.model, self.start, self.length, self.first_iterations)
 
     def _policy_jump(self, arrays: dict[str, np.ndarray], scale: float) -> np.ndarray:
-        """Return the policy's actions of a jump of the assumed robots from the command on, (LONGEST, 12, num_envs).
+        """Return the policy's actions of a jump of the assumed robots from the command on, (longest, 12, num_envs).
 
         `start` becomes their state at the command. arrays: of `Env.task_arrays`; scale [1]: of the goal.
         """
@@ -119,7 +121,7 @@ class PredictiveController:
         env.evaluation_reset(commands.astype(np.float32), arrays["heading"])
         wait = int(arrays["command_step"].min())
         actions = []
-        for i in range(wait + LONGEST):
+        for i in range(wait + self.longest):
             if i == wait:
                 self.start = start_of(env)
                 self.model.pose = self.start.q[7:].astype(float)

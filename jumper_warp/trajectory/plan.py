@@ -122,8 +122,9 @@ class PlanModel:
             self._allocate(len(actions))
         rollout = self.rollout
         rows = rollout.forward(self.default + self.scale * actions, start.q, start.qd, start.initial_target)
-        q, qd, impulse = (array.cpu().numpy() for array in (rollout.q[:rows], rollout.qd[:rows], rollout.impulse))
-        takeoff, touchdown = self._events(qd, impulse[: (rows - 1) * rollout.substeps], start)
+        last = slice(rollout.substeps - 1, (rows - 1) * rollout.substeps, rollout.substeps)
+        q, qd, impulse = (array.cpu().numpy() for array in (rollout.q[:rows], rollout.qd[:rows], rollout.impulse[last]))
+        takeoff, touchdown = self._events(qd, impulse, start)
         weights = self._weights(q, start, takeoff, touchdown)
         for into, values in zip(self._constants, (self.pose, self.goal, weights), strict=True):
             into[: len(values)].copy_(torch.from_numpy(values))
@@ -151,10 +152,9 @@ class PlanModel:
     def _events(self, qd: np.ndarray, impulse: np.ndarray, start: Start) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows of takeoff and touchdown, (num_worlds,), as the jump tasks define them; 0: before.
 
-        qd, impulse: as in `Trajectory`.
+        qd: as in `Trajectory`; impulse: likewise, of the last physics step of each policy step.
         """
-        force = np.abs(impulse).max((1, 3))
-        down = force[self.rollout.substeps - 1 :: self.rollout.substeps] > 1.0e-6
+        down = np.abs(impulse).max((1, 3)) > 1.0e-6
         rises = qd[1:, 2] > TAKEOFF_SPEED
         takeoff = np.where(start.phase == int(STANCE), first_row(~down & rises), 0)
         after = np.arange(1, len(down) + 1)[:, None] > takeoff

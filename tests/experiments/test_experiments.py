@@ -13,6 +13,7 @@ from experiments import (
     leg_springs,
     new_reward,
     rescue,
+    teacher,
     template,
     walk_jump_walk,
 )  # fmt: skip
@@ -220,6 +221,14 @@ def test_rescue_identifies_a_weak_motor_in_two_processes_and_lists_outcomes(tmp_
     assert saved.shape == (2, 1) and saved.any()
     assert values["weak_motor_savable_rate"] == saved.any(0).mean()
     assert values["weak_motor_known_saved_of_savable_rate"] == saved[0].sum() / saved.any(0).sum()
+    noisy = rescue.main(rescue.Args(**vars(args) | {"modes": ("identified",), "noise": True}))
+    assert noisy["weak_motor_identified_smallest_torque_factor"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_teacher_writes_the_policy_that_imitates_planned_jumps(tmp_path):
+    values = teacher.main(teacher.Args(robots=3, goals=(0.9, 1.3), epochs=1, threads=1, out=tmp_path, device="cpu"))
+    assert values["teacher_success_rate"] > values["policy_of_earth_success_rate"] == 0.0
+    assert teacher.Policy.load(tmp_path / "policy").interface.task == teacher.NAME
 
 
 def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
