@@ -80,7 +80,9 @@ def main(args: Args) -> dict[str, float]:
     """Simulate the jumps with all settings, and return mean errors and largest loop gaps [mm]."""
     folder = prepare("solver_accuracy", args)
     values: dict[str, float] = {}
-    references = {"jumper": jump(args, "jumper", FINE[0]), "mujoco": jump(args, "mujoco", *FINE[1])}
+    references = {"jumper": jump(args, "jumper", FINE[0])}
+    if args.mujoco:
+        references["mujoco"] = jump(args, "mujoco", *FINE[1])
     measured = {f"jumper_{refine}": jump(args, "jumper", refine) for refine in args.jumper}
     measured |= {"_".join(map(str, ("mujoco", *case))): jump(args, "mujoco", *case) for case in args.mujoco}
     for name, (*ends, gap) in measured.items():
