@@ -162,7 +162,9 @@ def help_field(flag: Flag) -> tuple[str, Any, Any]:
     metavar = flag.name if flag.positional else None
     settings = tyro.conf.arg(name=flag.name, metavar=metavar, help=flag.about, help_behavior_hint=hint)
     name = re.sub(r"\W", "_", flag.name)
-    return name, Annotated[(flag.kind, settings, *flag.marks)], dataclasses.field(default=flag.default)
+    required = flag.default is dataclasses.MISSING
+    field = dataclasses.field() if required else dataclasses.field(default_factory=lambda: flag.default)
+    return name, Annotated[(flag.kind, settings, *flag.marks)], field
 
 
 def check_numbers(settings: Any) -> None:

@@ -1,6 +1,7 @@
 """Distributed training: one process (rank) per device."""
 
 import hashlib
+import importlib
 import io
 import os
 from collections.abc import Callable
@@ -106,6 +107,9 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)
+        # default arguments of this module keep the group that exists at its import: with a group, its threads would
+        # outlive Python, and then abort the process
+        importlib.import_module("torch.distributed.nn.functional")
         try:
             torch.distributed.init_process_group("nccl" if selected.type == "cuda" else "gloo")
         except ValueError as error:  # a variable is missing

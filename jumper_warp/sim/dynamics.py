@@ -29,7 +29,7 @@ from jumper_warp.utils.newton_types import Model, State
 
 DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
 MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
-MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
+MAX_SWEEPS = 32  # Largest number of contact sweeps in a step
 TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
 MIN_WORLDS = 16
 """Smallest slice: for fewer worlds a thread costs more than it saves, and slices would share cache lines."""

@@ -1,4 +1,6 @@
+import importlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from experiments import (
     template,
     walk_jump_walk,
 )  # fmt: skip
+from jumper_warp.cli.main import parse
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
@@ -28,6 +31,16 @@ from metric_helpers import saved_metrics, values
 
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+FOLDER = Path(rescue.__file__).parent
+SCRIPTS = [path.stem for path in FOLDER.glob("*.py") if "run_script(main, Args)" in path.read_text()]
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS))
+def test_scripts_print_help(script, capsys):
+    with pytest.raises(SystemExit) as end:
+        parse(importlib.import_module(f"experiments.{script}").Args, script, ["--help"])
+    assert end.value.code == 0 and "--out PATH" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

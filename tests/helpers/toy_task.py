@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
+from jumper_warp.rl.distributed import init_distributed
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.rl.torch.ppo import Ppo
 
@@ -137,7 +138,7 @@ def join(rank: int, port: int) -> None:
 def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
     """Update from half of the worlds in one of two processes, and save the state to path + rank."""
     join(rank, port)
-    torch.distributed.init_process_group("gloo")
+    init_distributed("cpu")
     torch.manual_seed(0)
     ppo = Ppo(PushTask(4), cfg)
     fill(ppo, slice(4 * rank, 4 * rank + 4), 8)

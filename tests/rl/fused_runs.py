@@ -11,6 +11,7 @@ import torch
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
+from jumper_warp.rl.distributed import init_distributed
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, join, push_cfg
@@ -118,7 +119,7 @@ def update_rank(rank, port, path):
     """Iterate in one of two processes with different worlds, and save the state to path + rank."""
     _interpret()
     join(rank, port)
-    torch.distributed.init_process_group("gloo")
+    init_distributed("cpu")
     torch.manual_seed(0)
     ppo = make_ppo(NoiseTask(4), FUSED)
     torch.manual_seed(1 + rank)

@@ -22,7 +22,7 @@ from jumper_warp.utils.threads import available_threads
 
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
-MOST_SPLITS = 64  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
+MOST_SPLITS = 32  # Largest number of splits of the samples whose sums are added in a fixed order; a power of two
 SPLIT_ROWS = 512  # Smallest number of samples in a split; shorter ones cost more for their partial sums than they save
 MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
@@ -174,7 +174,8 @@ class FusedNetwork:
         """
         gather, block = index is not None, 32 if self._layers[0].inputs % 64 else 64
         if self._whole:
-            launch(kernels.network_forward, (blocks(rows, 64),), num_warps=8 if self._rows_per_sample == 2 else 4)(
+            warps = 8 if self._rows_per_sample == 2 else 4
+            launch(kernels.network_forward, (blocks(rows, 64),), num_warps=warps, num_stages=2)(
                 x, index if gather else x, self._weights, self._value, tuple(self._outputs), rows, self._places,
                 self._biases, self._padded, gather, 64, block,
             )  # fmt: skip
