@@ -13,6 +13,7 @@ from experiments import (
     leg_springs,
     new_reward,
     rescue,
+    solver_accuracy,
     teacher,
     template,
     walk_jump_walk,
@@ -163,6 +164,13 @@ def test_training_benchmark_reports_rates_of_solver_environment_and_both_trainer
     assert values == read_values(tmp_path)
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     assert min(*rates, values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"], values["ppo_steps_per_s_eager"]) > 0.0
+
+
+def test_errors_of_a_solver_decrease_with_finer_steps(tmp_path):
+    args = solver_accuracy.Args(num_robots=2, jumper=(1, 4), mujoco=(), out=tmp_path, device="cpu")
+    values = solver_accuracy.main(args)
+    assert 0.0 < values["jumper_4_apex_mm"] < 0.8 * values["jumper_1_apex_mm"] < 2.0
+    assert values["jumper_1_gap_mm"] < 0.001
 
 
 @pytest.mark.parametrize("settings", [{"envs": [2]}, {"envs": [32], "solvers": ["jumper"], "threads": [1, 2]}])
