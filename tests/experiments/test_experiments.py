@@ -33,8 +33,7 @@ from metric_helpers import saved_metrics, values
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-FOLDER = Path(rescue.__file__).parent
-SCRIPTS = [path.stem for path in FOLDER.glob("*.py") if "run_script(main, Args)" in path.read_text()]
+SCRIPTS = [file.stem for file in Path(rescue.__file__).parent.glob("*.py") if "(main, Args)" in file.read_text()]
 
 
 @pytest.mark.parametrize("script", sorted(SCRIPTS))
