@@ -12,6 +12,7 @@ environments; all other metrics are measured with the last number.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import warp as wp
 
@@ -31,6 +32,11 @@ class Args(DeviceArgs):
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
     repeats: int = 5  # Number of timed repetitions; the median is reported
     steps: int = 100  # Number of policy steps in a repetition of the standing test
+    iterations: int = 6  # Largest number of SolverMuJoCo's iterations in a physics step
+    ls_iterations: int = 6  # Largest number of line searches in each of these iterations
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"  # SolverMuJoCo's friction cone
+    refine: int = 1  # Factor on the number of SolverMuJoCo's physics steps
+    policy: bool = True  # Whether to time environments too, with the default settings of SolverMuJoCo
     threads: list[int] | None = None  # Numbers of CPU threads to compare (default: all cores, nothing is compared)
 
 
@@ -43,19 +49,22 @@ def main(args: Args) -> dict:
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")
     folder = output_dir("benchmark_solver", args.out)
-    sizes = args.steps, args.repeats, args.device
+    sizes = args.steps, args.repeats, args.device, args.refine
+    mujoco = {"iterations": args.iterations, "ls_iterations": args.ls_iterations, "cone": args.cone}
     for envs in args.envs:
-        metrics = {f"{s}_{name}": value for s in args.solvers for name, value in time_solver(s, envs, *sizes).items()}
-        for solver in args.solvers:
+        times = {solver: time_solver(solver, envs, *sizes, **mujoco) for solver in args.solvers}
+        metrics = {f"{solver}_{name}": value for solver in times for name, value in times[solver].items()}
+        for solver in args.solvers if args.policy else ():
             metrics[f"{solver}_steps_per_s_policy"] = envs / time_policy(envs, args.repeats, args.device, solver)
-        for phase in ("standing", "jump", "policy") if len(set(args.solvers)) == 2 else ():
+        phases = ("standing", "jump", "policy")[: 2 + args.policy]
+        for phase in phases if len(times) == 2 else ():
             rates = (metrics[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
             metrics[f"ratio_{phase}"] = next(rates) / next(rates)
         if args.threads and len(args.threads) > 1:
             metrics |= time_threads(envs, args.threads, args.steps, args.repeats)
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
-    values["envs"] = args.envs
+    values |= {"envs": args.envs, "refine": args.refine} | mujoco
     names = [f"{s}_steps_per_s_{phase}" for phase in ("standing", "jump", "policy") for s in args.solvers]
     ratios = ("ratio_standing", "ratio_jump", "ratio_policy")
     keys = [key for key in values if key.endswith((*names, *ratios, "thread_speedup"))]

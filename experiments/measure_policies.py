@@ -26,11 +26,9 @@ import torch
 import tyro
 
 from jumper_warp.evaluation.attitude import AttitudeFlags
-from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jump_metrics import JumpFlags
-from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.run import EvaluateCfg, EvaluationRun, evaluate
 from jumper_warp.evaluation.velocities import STANDING, VelocityFlags
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import policy_tasks
@@ -162,7 +160,7 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> Json:
         folder.mkdir(parents=True, exist_ok=True)
         payload_overlay(run.recipe.robot, payload).save(values["robot"])
     conditions = Conditions(**values, seed=seed, device=args.device, threads=args.threads)
-    flags = with_trials(default_flags(run.evaluation, "evaluate"), args.trials)
+    flags = with_trials(run.evaluation.default_flags("evaluate"), args.trials)
     run.settings["commands"] = commands_of(flags)
     with contextlib.redirect_stdout(io.StringIO()):
         return evaluate(run, EvaluateCfg(flags, conditions, folder))

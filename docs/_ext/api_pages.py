@@ -39,7 +39,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "policies.policy", "policies.spec", "policies.catalog", "policies.onnx", "deploy.policy",
     )),
     "evaluation": ("Evaluation", (
-        "evaluation.run", "evaluation.conditions", "evaluation.skills", "evaluation.evaluations",
+        "evaluation.run", "evaluation.conditions", "evaluation.skills",
         "evaluation.log", "evaluation.commands", "evaluation.suites",
         "evaluation.sweeps", "evaluation.episodes", "evaluation.jump_metrics",
         "evaluation.velocities", "evaluation.attitude", "evaluation.jumps", "evaluation.courses",

@@ -32,9 +32,9 @@ from jumper_warp.cli.try_task import TryCfg
 from jumper_warp.cli.watch import WatchArgs
 from jumper_warp.deploy.main import parser as deploy_parser
 from jumper_warp.evaluation.agents import AgentCfg
-from jumper_warp.evaluation.commands import DumpCfg, EvaluateCfg, PlayCfg, ScriptCfg
-from jumper_warp.evaluation.evaluations import default_flags
+from jumper_warp.evaluation.commands import DumpCfg, PlayCfg, ScriptCfg
 from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
+from jumper_warp.evaluation.run import EvaluateCfg
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.evaluation import EpisodeEvaluation
@@ -65,12 +65,12 @@ def cli_page() -> str:
         section("watch RUN", doc(WatchArgs), list_flags(WatchArgs)),
         section("finetune POLICY", COMMANDS["finetune"], list_flags(FinetuneArgs)),
         of_kinds("play", ABOUT_PLAY,
-                 {name: list_flags(PlayCfg(default_flags(each, "play"))) for name, each in stock.items()},
+                 {name: list_flags(PlayCfg(each.default_flags("play"))) for name, each in stock.items()},
                  {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg),
                   "Flags with --log": list_flags(LogCfg), "Flags with --agent": list_flags(AgentCfg)}),
         section("drive POLICY ...", doc(DriveCfg), list_flags(DriveCfg)),
         of_kinds("evaluate", ABOUT_EVALUATE,
-                 {name: list_flags(EvaluateCfg(default_flags(each, "evaluate"))) for name, each in stock.items()},
+                 {name: list_flags(EvaluateCfg(each.default_flags("evaluate"))) for name, each in stock.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
         section("compare A B ...", doc(CompareCfg), list_flags(CompareCfg)),
         section("try FILE", doc(TryCfg), list_flags(TryCfg)),

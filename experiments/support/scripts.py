@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from jumper_warp.cli.main import parse, run_command
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import check_words, run_command
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
@@ -55,6 +56,7 @@ def parse_flags(kind: type[Args]) -> Args:
     # lines of a paragraph or of an item of a list become one, which the help wraps at the terminal's width
     about = re.sub(r"(?<!\n)\n {0,3}(?![\s-]|\d+\. )", " ", sys.modules["__main__"].__doc__ or "").strip()
     name = Path(sys.argv[0]).name
+    check_words(sys.argv[1:])
     return parse(kind, name, sys.argv[1:], description=about, program=f"python experiments/{name}")
 
 

@@ -6,6 +6,7 @@ import contextlib
 import io
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,9 +18,10 @@ from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.logger import Stopwatch
-from jumper_warp.robot.model import build_model
+from jumper_warp.robot.model import PHYSICS_DT, build_model
 from jumper_warp.sim.dynamics import WorldRange
-from jumper_warp.sim.simulation import Simulation, SlicedGraph, SolverName
+from jumper_warp.sim.mujoco import MujocoDynamics, mujoco_solver
+from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
 from support.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
@@ -77,10 +79,13 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
     return float(np.median(times)), float(apex.mean())
 
 
-def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
+def time_solver(
+    solver: SolverName, envs: int, steps: int, repeats: int, device: str | None, refine: int = 1, **settings: Any
+) -> dict[str, float]:
     """Time one solver with standing and jumping robots, and return the metrics.
 
-    envs: number of environments; steps: in each repetition of standing.
+    envs: number of environments; steps: in each repetition of standing; refine, settings: of SolverMuJoCo, factor on
+    the number of physics steps, and arguments of `mujoco_solver`.
     """
     build_model(1, device=device)  # Newton's own modules are not part of the metrics
     before = device_memory(wp.get_device(device))
@@ -88,7 +93,10 @@ def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device:
 
     def build() -> None:
         """Build the simulation, compile its kernels and capture its graph."""
-        sims.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device))
+        finer = {"dt": PHYSICS_DT / refine, "substeps": SUBSTEPS * refine} if solver == "mujoco" else {}
+        sims.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device, **finer))
+        if isinstance(sims[0].dynamics, MujocoDynamics):
+            sims[0].dynamics.solver = mujoco_solver(sims[0].model, dt=sims[0].dt, **settings)
         sims[0].step()
         sims[0].step()
 

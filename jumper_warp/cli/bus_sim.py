@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from jumper_warp.bench.faults import BusFaults
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.utils.checks import check_count, check_not_negative, check_number, check_probabilities, check_seed
 
 

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from jumper_warp.cli.flags import values_of
-from jumper_warp.cli.main import UsageError, parse
+from jumper_warp.cli.flags import parse, values_of
+from jumper_warp.cli.main import UsageError
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.registry import load_task_module
 from jumper_warp.utils.checks import check_count, check_types

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from platform import platform
 from types import ModuleType
 from typing import Any
 
-from jumper_warp.cli.main import FAULT, parse
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import FAULT
 
 TASK = "vertical-jump"  # Task of the environment that is stepped
 WORLDS = 64  # Worlds of the environment
@@ -42,13 +42,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         return
     import warp as wp
 
-    from jumper_warp.utils.runtime import init_warp, source_versions
+    from jumper_warp.utils.runtime import init_warp, source_versions, versions
 
     init_warp()
     source = source_versions()
     commit = f"{source['commit'] or 'unknown'}{', changed' if source['dirty'] else ''}"
     rows = {"commit": commit, "package": str(Path(__file__).resolve().parents[1]), "system": platform()}
-    rows |= source["versions"] | {name: version_of(name) for name in PACKAGES}
+    rows |= source["versions"] | versions(PACKAGES)
     for name, text in rows.items():
         print(f"{name:<20}{text or '-'}")
     failed = False
@@ -74,14 +74,6 @@ def check_task(name: str) -> None:
         failed = failed or bool(failure)
     if failed:
         raise SystemExit(FAULT)
-
-
-def version_of(package: str) -> str | None:
-    """Return the version of an installed package; None: it is not installed."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def check_device(device: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.skills import SkillNames
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from jumper_warp.cli.flags import parse as parse_flags
 from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
-from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.utils.errors import suggestion
 from jumper_warp.utils.files import read_json
 
@@ -51,7 +51,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     if SUITE in args:
         run_suite(run.task, args, modules)
         return
-    from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
+    from jumper_warp.evaluation.run import EvaluateCfg, evaluate
 
     check_suite_flags(run.task, args)
     evaluate(run, parse("evaluate", run.task, args, EvaluateCfg))
@@ -59,13 +59,12 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def check_suite_flags(task: TaskCfg, args: Sequence[str]) -> None:
     """Raise UsageError if args, without --suite, have a flag that only test suites of the task's policies have."""
-    from jumper_warp.evaluation.commands import EvaluateCfg
     from jumper_warp.evaluation.conditions import Conditions
-    from jumper_warp.evaluation.evaluations import default_flags
+    from jumper_warp.evaluation.run import EvaluateCfg
     from jumper_warp.evaluation.suites import suites_for
     from jumper_warp.utils.summary import PrintFlags
 
-    kinds = (EvaluateCfg, type(default_flags(task.evaluation, "evaluate")), Conditions, PrintFlags)
+    kinds = (EvaluateCfg, type(task.evaluation.default_flags("evaluate")), Conditions, PrintFlags)
     known = {field.name for kind in kinds for field in fields(kind)}
     for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
         name = flag[2:].replace("-", "_")
@@ -136,8 +135,7 @@ def parse(command: Literal["evaluate", "play"], task: TaskCfg, args: Sequence[st
     kind: generic dataclass of the settings, such as `EvaluateCfg`. Raises UsageError: a flag belongs to other tasks
     only, or a setting is out of range.
     """
-    from jumper_warp.evaluation.evaluations import default_flags
 
     policy, *args = args
-    flags = default_flags(task.evaluation, command)
+    flags = task.evaluation.default_flags(command)
     return parse_flags(kind[type(flags)], f"{command} {policy}", args, description=kind.__doc__, default=kind(flags))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -99,9 +99,10 @@ def files_for_page(policy: Policy, name: str) -> dict[str, bytes]:
 
     try:
         return browser_files(policy, name)
+    except TaskError:
+        return {}
     except InputError as error:
-        if not isinstance(error.__cause__, TaskError):
-            print(f"without files for the web page: {error}", file=sys.stderr)
+        print(f"without files for the web page: {error}", file=sys.stderr)
         return {}
 
 

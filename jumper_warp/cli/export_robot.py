@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 
 
 @dataclass(frozen=True)

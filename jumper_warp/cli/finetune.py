@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 from jumper_warp.cli.evaluate import policy_of
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 
 ABOUT = """\
 Reduce the errors of a jumping policy by gradients through physics, motors and

@@ -1,14 +1,17 @@
-"""List of the flags that tyro generates from a dataclass, for short help pages and limits."""
+"""Parsing of flags, which tyro generates from a dataclass of settings; their list, help pages and limits."""
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
+import io
 import itertools
 import math
 import re
+import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +21,7 @@ import tyro
 
 from jumper_warp.utils.checks import MOST_WORLDS
 from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.files import Json
 
 LARGEST = 2.0**31  # Largest absolute value of a number in a flag
 MOST_TRIALS = 100_000  # Largest number of jumps, walks or robots, which needs some 10 GB
@@ -124,6 +128,47 @@ def field_docs(kind: type) -> dict[str, str]:
 def wants_help(args: Sequence[str]) -> bool:
     """Return whether command-line arguments ask for help."""
     return any(arg in (*HELP, HELP_ALL) for arg in args)
+
+
+def parse(
+    kind: Any,
+    command: str,
+    args: Sequence[str],
+    *,
+    description: str | None = None,
+    default: Any = None,
+    short: Sequence[str] | None = None,
+    program: str | None = None,
+) -> Any:
+    """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
+
+    kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
+    `kind`. short: names of the flags of --help (default: all). program: command line of a script in place of
+    `jumper COMMAND`, without --task-module.
+    Raises InputError: a setting is out of range. Exits with 2 and tyro's message: there is no such flag, or a value is
+    missing or of another type.
+    """
+    settings: Json = {"prog": program or f"jumper {command}"}
+    about = description or inspect.getdoc(kind) or ""
+    if wants_help(args):
+        flags = list_flags(kind if default is None else default) + ([] if program else [TASK_MODULE_FLAG])
+        print_help(settings["prog"], about, flags, args, short)
+    settings |= {} if default is None else {"default": default}
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            parsed = tyro.cli(kind, args=args, **settings)
+    except SystemExit as end:
+        error: BaseException | None = end
+        while error is not None and not isinstance(error, InputError):
+            error = error.__context__
+        if error is not None:  # raised by a dataclass of settings; tyro has printed it in a box
+            raise error from None
+        print(printed.getvalue(), end="", file=sys.stderr)
+        raise
+    print(printed.getvalue(), end="", file=sys.stderr)
+    check_numbers(parsed)
+    return parsed
 
 
 def print_help(

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from jumper_warp.cli.flags import parse
 from jumper_warp.cli.list import describe, size_text
-from jumper_warp.cli.main import parse
 from jumper_warp.utils.files import Json
 from jumper_warp.utils.tables import WIDTH, table_lines
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.utils.files import Json
 
 if TYPE_CHECKING:

@@ -5,10 +5,8 @@ A command imports only what it needs, so that help and usage errors print at onc
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import importlib
-import inspect
 import io
 import itertools
 import os
@@ -17,10 +15,8 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
-from typing import Any
 
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
-from jumper_warp.utils.files import Json
 from jumper_warp.utils.startup import open_standard_streams, prepare_imports
 from jumper_warp.utils.version import __version__
 
@@ -164,52 +160,6 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
             raise UsageError(f"{TASK_MODULE} needs a FILE.py or the name of a module")
         names.append(name)
     return rest, names
-
-
-def parse(
-    kind: Any,
-    command: str,
-    args: Sequence[str],
-    *,
-    description: str | None = None,
-    default: Any = None,
-    short: Sequence[str] | None = None,
-    program: str | None = None,
-) -> Any:
-    """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
-
-    kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
-    `kind`. short: names of the flags of --help (default: all). program: command line of a script in place of
-    `jumper COMMAND`, without --task-module.
-    Raises InputError: a setting is out of range. Exits with 2 and tyro's message: there is no such flag, or a value is
-    missing or of another type.
-    """
-    check_words(args)
-    import tyro
-
-    from jumper_warp.cli.flags import TASK_MODULE_FLAG, check_numbers, list_flags, print_help, wants_help
-
-    settings: Json = {"prog": program or f"jumper {command}"}
-    about = description or inspect.getdoc(kind) or ""
-    if wants_help(args):
-        flags = list_flags(kind if default is None else default) + ([] if program else [TASK_MODULE_FLAG])
-        print_help(settings["prog"], about, flags, args, short)
-    settings |= {} if default is None else {"default": default}
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(printed):
-            parsed = tyro.cli(kind, args=args, **settings)
-    except SystemExit as end:
-        error: BaseException | None = end
-        while error is not None and not isinstance(error, InputError):
-            error = error.__context__
-        if error is not None:  # raised by a dataclass of settings; tyro has printed it in a box
-            raise error from None
-        print(printed.getvalue(), end="", file=sys.stderr)
-        raise
-    print(printed.getvalue(), end="", file=sys.stderr)
-    check_numbers(parsed)
-    return parsed
 
 
 def run_command(command: Callable[[], object]) -> None:

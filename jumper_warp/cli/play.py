@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.evaluate import open_run, parse, policy_of
 from jumper_warp.cli.flags import option_of, wants_help
-from jumper_warp.cli.main import parse as parse_flags
+from jumper_warp.cli.flags import parse as parse_flags
 
 if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg

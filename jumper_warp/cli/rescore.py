@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.main import UsageError, parse
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import UsageError
 
 if TYPE_CHECKING:
     from jumper_warp.robot.overlay import RobotOverlay

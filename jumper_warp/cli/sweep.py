@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from jumper_warp.cli.compare import read_settings
-from jumper_warp.cli.main import FAULT, parse, print_error
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import FAULT, print_error
 from jumper_warp.registry import load_task_module
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jumper_warp.cli.main import INCONSISTENT, TASK_MODULE_HELP, UsageError, parse
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import INCONSISTENT, TASK_MODULE_HELP, UsageError
 from jumper_warp.identification.motions import NoiseLevels, load_motions
 from jumper_warp.identification.parameters import jumper_parameters, total_mass, weighed_mass
 from jumper_warp.utils.errors import InputError

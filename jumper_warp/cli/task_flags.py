@@ -11,12 +11,13 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import tyro
 import warp as wp
 
-from jumper_warp.cli.flags import field_docs
+from jumper_warp.cli.flags import field_docs, parse
 from jumper_warp.tasks.cfg import Command, Reset, TaskCfg
 from jumper_warp.tasks.evaluation import Evaluation
 from jumper_warp.tasks.terms import Term
@@ -33,6 +34,25 @@ class Setting(NamedTuple):
     kind: Any  # type of the setting, for tyro
     value: Any  # default; of a group, an instance of its dataclass
     about: str | None = None  # help text
+
+
+def parse_with_task(
+    default: Any, task: TaskCfg, command: str, args: Sequence[str], short: Sequence[str]
+) -> tuple[Any, TaskCfg]:
+    """Parse a command's settings and a task's, and return the settings, and the task changed by its flags `--env`.
+
+    default: the command's settings, a dataclass, with their defaults. tyro needs one dataclass of all flags: that of
+    `default` is extended by a field with the task's. short: see `parse`, which also lists errors and exits.
+    """
+    flags = flags_of(task)
+    settings = type(default)
+    kind = dataclasses.make_dataclass(
+        settings.__name__, [("env", type(flags), flags)], bases=(settings,), frozen=True,
+        namespace={"__module__": settings.__module__},
+    )  # fmt: skip
+    about = f"Train a policy on {task.name}."
+    parsed = parse(kind, command, args, description=about, default=kind(**vars(default)), short=short)
+    return parsed, with_flags(task, parsed.env)
 
 
 def flags_of(task: TaskCfg) -> Any:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.flags import option_of, switch_of, values_of, wants_help
-from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
+from jumper_warp.cli.flags import option_of, parse, switch_of, values_of, wants_help
+from jumper_warp.cli.main import TASK_MODULE, UsageError
 from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
-from jumper_warp.utils.files import Json, parse_json
+from jumper_warp.utils.files import parse_json
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from jumper_warp.rl.checkpoint import Checkpoint
     from jumper_warp.rl.run_folder import TrainResult
     from jumper_warp.robot.overlay import RobotOverlay
-    from jumper_warp.tasks.cfg import TaskCfg
 
 
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
@@ -83,17 +82,20 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     if not args or args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    preset = preset_flags(name, entry, args[1:])
     args = args[1:]
+    preset = preset_flags(name, entry, args)
+    from jumper_warp.cli.task_flags import parse_with_task
     from jumper_warp.recipe import Recipe
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    recipe, checkpoints = resumed(Recipe.of(name, overlay_in(args)), args)
-    parsed, task = parse_settings(recipe, [*preset, *args])
+    robot = overlay_in(args)
+    recipe, checkpoints = resumed(Recipe(entry.task(name, robot), entry.training(name), robot=robot), args)
+    default = TrainArgs(recipe.train, recipe.solver, recipe.randomize, recipe.noise)
+    parsed, task = parse_with_task(default, recipe.task, f"train {name}", [*preset, *args], SHORT_HELP)
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
-    robot = overlay_in(args) or recipe.robot
+    robot = robot or recipe.robot
     if robot is not None:
         task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
     given = {name: getattr(parsed, name) for name in ("solver", "randomize", "noise")}
@@ -111,8 +113,7 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
     session = {name: values[0] for name, values in flags.items() if values}
     if "resume" not in session:
         return recipe, []
-    from jumper_warp.rl.checkpoint import CheckpointError
-    from jumper_warp.rl.resume import find_checkpoints
+    from jumper_warp.rl.checkpoint import CheckpointError, find_checkpoints
     from jumper_warp.rl.run_names import seed_folders
 
     checkpoints = find_checkpoints(dataclasses.replace(recipe.train, **session))
@@ -153,24 +154,6 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
         flags += [] if switch_of(option) in given else [word]
     print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
     return flags
-
-
-def parse_settings(recipe: Recipe, args: Sequence[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings parsed from `args`, with the recipe's as defaults, and the task changed by its --env flags.
-
-    tyro needs one dataclass of all flags: `TrainArgs`, here extended by a field with those of the task.
-    Exits with 0 after help. Raises InputError: a setting is out of range.
-    """
-    from jumper_warp.cli.task_flags import flags_of, with_flags
-
-    task = recipe.task
-    flags = flags_of(recipe.task)
-    made: Json = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
-    kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
-    default = kind(recipe.train, solver=recipe.solver, randomize=recipe.randomize, noise=recipe.noise)
-    about = f"Train a policy on {task.name}."
-    parsed = parse(kind, f"train {task.name}", args, description=about, default=default, short=SHORT_HELP)
-    return parsed, with_flags(task, parsed.env)
 
 
 def overlay_in(args: Sequence[str]) -> RobotOverlay | None:

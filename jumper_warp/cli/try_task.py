@@ -11,7 +11,7 @@ from types import ModuleType
 
 import tyro
 
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.rl.cfg import TrainCfg
 
 SECONDS = 10.0  # [s] Training time of each of the two trainings on a GPU

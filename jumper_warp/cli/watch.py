@@ -8,7 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-from jumper_warp.cli.main import UsageError, parse
+from jumper_warp.cli.flags import parse
+from jumper_warp.cli.main import UsageError
 from jumper_warp.utils.checks import check_not_negative
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from jumper_warp.compare import statistics
 from jumper_warp.compare.arms import Arm, differences, find_arms, of_equal_length
 from jumper_warp.evaluation.conditions import Conditions
-from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.catalog import ERRORS, SUCCESSES
 from jumper_warp.tasks.cfg import TaskCfg
@@ -193,7 +192,7 @@ def _evaluate(
             run = EvaluationRun(member.folder, modules)
             own = test if run.task.state is test.state else run.task
             try:
-                flags = dataclasses.replace(default_flags(own.evaluation, "evaluate"), **evaluation)
+                flags = dataclasses.replace(own.evaluation.default_flags("evaluate"), **evaluation)
             except (TypeError, ValueError) as error:
                 raise InputError(f"evaluation: {error}") from error
             run.conditions = conditions

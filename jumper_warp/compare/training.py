@@ -9,8 +9,8 @@ from pathlib import Path
 from jumper_warp.compare.arms import OF_A_SEED, Member, differences
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import last_metrics
-from jumper_warp.rl.resume import FROZEN, find_checkpoints, flat_settings
-from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, newest, seed_folders, title
+from jumper_warp.rl.resume import flat_settings
+from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, MANIFEST, newest, seed_folders, title
 from jumper_warp.rl.runner import Observer
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
@@ -39,6 +39,5 @@ def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
         raise InputError(f"{run} was trained with another {next(iter(changed))}: remove it, or choose another log root")
     if all(last_metrics(folder).get("iteration", 0) >= cfg.max_iterations for folder in folders):
         return run
-    resumed = dataclasses.replace(cfg, resume=str(run))
-    checkpoints = find_checkpoints(resumed)
-    return train(dataclasses.replace(recipe, train=resumed), checkpoints=checkpoints, observers=observers).folder
+    resumed = dataclasses.replace(recipe, train=dataclasses.replace(cfg, resume=str(run)))
+    return train(resumed, observers=observers).folder

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs import arrays
 from jumper_warp.envs.gradients import EnvGradients
-from jumper_warp.envs.stages import STAGES, Stages, usual_kernels
+from jumper_warp.envs.skill import TaskRuntime, kernels_of
+from jumper_warp.envs.stages import STAGES, Stages, with_blocks
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.env import Counters
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
@@ -130,7 +131,8 @@ class Env(Stages):
         init_warp()
         self.wp_device = wp.get_device(None if device is None else str(device))
         physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
-        with loading_kernels([*physics, *usual_kernels(run, auto_reset)], self.wp_device):
+        by_task = [kernels_of(each) for each in run]
+        with loading_kernels([*physics, *with_blocks(by_task, auto_reset)], self.wp_device):
             self.sim = Simulation(
                 num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
                 block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
@@ -152,7 +154,9 @@ class Env(Stages):
         self.step_hooks: list[Callable[[], None]] = []
         """Functions that `step` calls last, also within a captured graph; they must not change the environment."""
         self.gradients_of_step: EnvGradients | None = None
-        self._allocate(run, skill, handovers, moves_of(self.overlay))
+        sizes = (num_envs, self.step_dt, self.sim.substeps, self.wp_device, len(self.sim.slices))
+        self.skills = [TaskRuntime(each, i, *sizes) for i, each in enumerate(run)]
+        self._allocate(skill, handovers, moves_of(self.overlay))
         self._show()
 
     def _show(self) -> None:
@@ -500,4 +504,8 @@ class Env(Stages):
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)
+        self._started = bool((self.episodes.step_count.numpy() > arrays.FIRST_STEP_COUNT).all())
+        for skill in self.skills:
+            skill.params.restore()
+        self.sim.dynamics.parameters_changed()
         self._restart_gradients()

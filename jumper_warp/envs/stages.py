@@ -15,7 +15,7 @@ import warp as wp
 
 from jumper_warp.envs import arrays
 from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import TaskRuntime, kernels_of
+from jumper_warp.envs.skill import TaskRuntime
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
@@ -41,14 +41,13 @@ EVENT_BLOCKS = 264
 """Largest number of blocks of event kernels. Most threads are idle, and a new block costs more than another pass."""
 
 
-def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, int]]:
-    """Return the kernels that any environment of given tasks launches, with block sizes; the slowest compile first.
+def with_blocks(by_task: Sequence[dict[str, Kernel]], draws: bool) -> list[tuple[Kernel, int]]:
+    """Return the kernels that any environment launches, with block sizes; the slowest compile first.
 
-    draws: include those of `reset`, else those of `evaluation_reset`.
+    by_task: kernels of each task, see `kernels_of`. draws: include those of `reset`, else those of `evaluation_reset`.
     """
     names = ("reset" if draws else "set_command", "step", "observe", "event")
     shared = [track_kernel, action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel]
-    by_task = [kernels_of(task) for task in tasks]
     kernels = [(kernels[name], BLOCKS.get(name, BLOCK)) for name in names for kernels in by_task]
     return [*kernels, *((kernel, BLOCK) for kernel in shared), (postprocess_obs_kernel, POSTPROCESS_BLOCK)]
 
@@ -74,6 +73,7 @@ class Stages(Uncopied):
 
     sim: Simulation
     tasks: tuple[TaskCfg, ...]
+    skills: list[TaskRuntime]
     num_envs: int
     seed: int
     stream: Purpose
@@ -84,23 +84,19 @@ class Stages(Uncopied):
     _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
-    def _allocate(
-        self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves
-    ) -> None:
-        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one.
+    def _allocate(self, skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves) -> None:
+        """Allocate the arrays that all tasks share; skill: index of each world's first task, (num_envs,) or one.
 
         moves: differences of the robot from the described one.
         """
         n = self.num_envs
+        tasks = tuple(each.task for each in self.skills)
         device = self.wp_device
         sim = self.sim
         wp.copy(sim.state.joint_q, sim.model.joint_q)  # ankle quaternions too, which only the default pose writes
         self._first_skill = arrays.checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
-        self.skills = [
-            TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
-        ]
-        self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
+        self.parameters = robot_parameters(sim, tasks, active, moves)
         self.robot = arrays.robot_arrays(sim, self.step_dt)
         self._scene = arrays.scene_of(sim)
         self.episodes = arrays.episode_arrays(n, self.seed, self.stream, active, device)
@@ -117,22 +113,12 @@ class Stages(Uncopied):
             (make_handover_kernel(h), self.tasks.index(h.source), self.tasks.index(h.target)) for h in handovers
         ]
 
-    def after_load_state(self) -> None:
-        """Update the flag `_started`, term parameters and solver after `load_state` wrote the environment's arrays.
-
-        Step counts are FIRST_STEP_COUNT until the first step. Parameters that were set by hand keep their values.
-        """
-        self._started = bool((self.episodes.step_count.numpy() > arrays.FIRST_STEP_COUNT).all())
-        for skill in self.skills:
-            skill.params.restore()
-        self.sim.dynamics.parameters_changed()
-
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
         """Return the kernels of `step`, and of `reset` if draws, else `evaluation_reset`, each with its block size."""
         shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
-        kernels = usual_kernels([skill.task for skill in self.skills], draws)
+        kernels = with_blocks([skill.kernels for skill in self.skills], draws)
         return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.dynamics.step_kernels()]
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:

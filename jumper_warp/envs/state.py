@@ -26,7 +26,6 @@ MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "of
 """Names of the saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
 SEED = "seed"  # Key of the seed (`purpose_seed`)
-COUNTERS = "/counters."  # In the keys of episode statistics, after the task's name
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
@@ -45,10 +44,9 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Restore a saved state of an environment, so that the following steps are bitwise the same.
+    """Restore the arrays of a saved state of an environment; `Env.load_state_dict` updates what follows from them.
 
-    States of earlier versions lack counters and conditions: counters become 0. Values that are not finite are restored
-    too: without `auto_reset` a diverged world keeps them.
+    Values that are not finite are restored too: without `auto_reset` a diverged world keeps them.
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
     noise, refine or version.
     """
@@ -58,8 +56,6 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     tensors = _tensors(env)
     saved = {prefix: records(array).copy() for prefix, array in _records(env).items()}
     conditions = _conditions(env)
-    counters = {name: torch.zeros_like(tensor, device="cpu") for name, tensor in tensors.items() if COUNTERS in name}
-    state = counters | conditions | state
     fields = {prefix + name: (prefix, name) for prefix, values in saved.items() for name in values.dtype.names or ()}
     names = {*tensors, *fields, *conditions, FINGERPRINT, SEED}
     if names != state.keys():
@@ -92,7 +88,6 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         array.assign(wp.array(saved[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
-    env.after_load_state()
 
 
 def _conditions(env: Stages) -> dict[str, torch.Tensor]:
@@ -133,5 +128,5 @@ def _tensors(env: Stages) -> dict[str, torch.Tensor]:
         arrays |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
         own = {"timer": skill.timer, "changed": skill.params.changed, "episode_sum": skill.episode_sum}
         arrays |= {f"{skill.task.name}/{name}": array for name, array in own.items()}
-        arrays |= {f"{skill.task.name}{COUNTERS}{name}": getattr(skill.counters, name) for name in Counters.vars}
+        arrays |= {f"{skill.task.name}/counters.{name}": getattr(skill.counters, name) for name in Counters.vars}
     return {name: wp.to_torch(array) for name, array in arrays.items() if isinstance(array, wp.array)}

@@ -1,4 +1,4 @@
-"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics.
+"""Implementation of `jumper play`: record a policy, a script of commands or a state of a training, and show it.
 
 Functions import what they need, so that the help of the settings needs neither PyTorch nor Newton.
 """
@@ -19,8 +19,7 @@ import tyro
 from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.skills import SkillNames
-from jumper_warp.policies.catalog import add_files, find_policy, is_run, run_folder
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.catalog import is_run, run_folder
 from jumper_warp.rl.run_names import title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
@@ -39,49 +38,6 @@ SCRIPT_SUMMARY = (
     "settled_slewed_rmse_vx_m_s", "settled_slewed_rmse_vy_m_s", "settled_slewed_rmse_yaw_rate_rad_s",
 )  # fmt: skip
 """Keys of the metrics in the summary of `jumper play --script`."""
-
-
-@dataclass(frozen=True)
-class EvaluateCfg(Generic[Flags]):
-    """Measure a policy over many trials, print its metrics and write metrics.json."""
-
-    flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """Flags of the task's kind, see `jumper_warp.tasks.evaluation.Evaluation.flags`."""
-    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """Conditions of the evaluation."""
-    out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
-    printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
-    """Format of the printed results."""
-    save_trials: bool = False  # Also write the arrays of all trials, from which the metrics are computed, to trials.npz
-    save_to_policy: bool = False  # Also save the metrics into the policy's folder
-
-
-def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> Json:
-    """Evaluate a policy, write `metrics.json`, print a summary, and return conditions and metrics by name.
-
-    Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
-    than reporting; OSError: the folder cannot be created.
-    """
-    from jumper_warp.evaluation.run import HEADLINES
-    from jumper_warp.evaluation.trained import trained_success
-    from jumper_warp.registry import TASKS
-
-    if cfg.save_to_policy and cfg.conditions.stream != "reporting":
-        raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
-    if cfg.save_to_policy and is_run(run.source):
-        raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
-    run.print_flags = cfg.printing
-    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
-    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
-    run.run_episodes(run.env(log.count), log)
-    metrics = cfg.flags.metrics(log) | trained_success(run.task, log)
-    entry = TASKS.get(run.task.name)
-    paper = run.evaluation.paper if entry and entry.of_project else {}
-    values = run.report(metrics, paper, (*HEADLINES, *log.main_metrics))
-    if cfg.save_to_policy:
-        files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
-        add_files(find_policy(run.source), files)
-    return values
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,6 @@ from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
-from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_flags, check_seed, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
@@ -111,7 +110,8 @@ class Conditions:
 
         With fixed parameters and no randomisation it is on level ground, without the task's events.
         """
-        task = (task if self.gravity is None else replace(task, gravity=self.gravity)).without_margins()
+        gravity = task.gravity if self.gravity is None else self.gravity
+        task = replace(task, gravity=gravity, self_collision_margin=0.0, obstacle_margin=0.0)
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
@@ -157,14 +157,11 @@ def env_of_recipe(
     It has no critic observation, and events only if randomised.
     change: returns a modified task before the conditions are applied. rewards: whether it has the task's rewards.
     scene: further arguments of `Env`.
-    Raises PolicyError: an event is needed, and its function was not found.
+    Raises TaskError: an event is needed, and its function was not found.
     """
     from jumper_warp.envs.env import Env
 
-    try:
-        task = recipe.tested_task(conditions.randomize, rewards)
-    except TaskError as error:
-        raise PolicyError(str(error)) from error
+    task = recipe.tested_task(conditions.randomize, rewards)
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
         return Env(task, num_envs, **conditions.env_settings(recipe.robot) | scene)

@@ -1,6 +1,6 @@
 """Evaluation of a policy: its environment, recorded runs of episodes, and the report of their metrics.
 
-Experiments and the commands `jumper evaluate` and `jumper play` use this module.
+`evaluate` is the command `jumper evaluate`; experiments and `jumper play` use the classes.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 
 import numpy as np
 import tyro
@@ -21,8 +21,10 @@ from jumper_warp.evaluation.conditions import Conditions, env_of_recipe, shared_
 from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.skills import WALK, SkillNames
-from jumper_warp.evaluation.trained import trained_range
+from jumper_warp.evaluation.trained import trained_range, trained_success
+from jumper_warp.policies.catalog import add_files, find_policy, is_run
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import TASKS
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
@@ -56,6 +58,7 @@ HEADLINES = (
 MOST_ENDS = 6  # Largest number of terminations in a summary, the most frequent ones
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
 Log = TypeVar("Log", bound=EvaluationLog)
+Flags = TypeVar("Flags")
 
 
 @dataclass(frozen=True)
@@ -245,7 +248,7 @@ class EvaluationRun(Run):
         """Load a policy; call `prepare` before any other method.
 
         source: name or folder of a policy, a run's folder, or a checkpoint; modules: the user's task modules.
-        Raises PolicyError or CheckpointError.
+        Raises PolicyError, TaskError or CheckpointError.
         """
         super().__init__()
         self.source = source
@@ -288,7 +291,7 @@ class EvaluationRun(Run):
         conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:
-        """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_recipe`.
+        """Return an environment of the policy's task with `count` worlds. Raises TaskError, see `env_of_recipe`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
@@ -301,6 +304,45 @@ class EvaluationRun(Run):
         self.settings["torque_limit_nm"] = torque_limit(env)
         self.note_robot(env)
         return env
+
+
+@dataclass(frozen=True)
+class EvaluateCfg(Generic[Flags]):
+    """Measure a policy over many trials, print its metrics and write metrics.json."""
+
+    flags: Annotated[Flags, tyro.conf.arg(name="")]
+    """Flags of the task's kind, see `jumper_warp.tasks.evaluation.Evaluation.flags`."""
+    conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
+    """Conditions of the evaluation."""
+    out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
+    printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
+    """Format of the printed results."""
+    save_trials: bool = False  # Also write the arrays of all trials, from which the metrics are computed, to trials.npz
+    save_to_policy: bool = False  # Also save the metrics into the policy's folder
+
+
+def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> Json:
+    """Evaluate a policy, write `metrics.json`, print a summary, and return conditions and metrics by name.
+
+    Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
+    than reporting; OSError: the folder cannot be created.
+    """
+    if cfg.save_to_policy and cfg.conditions.stream != "reporting":
+        raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
+    if cfg.save_to_policy and is_run(run.source):
+        raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
+    run.print_flags = cfg.printing
+    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
+    run.run_episodes(run.env(log.count), log)
+    metrics = cfg.flags.metrics(log) | trained_success(run.task, log)
+    entry = TASKS.get(run.task.name)
+    paper = run.evaluation.paper if entry and entry.of_project else {}
+    values = run.report(metrics, paper, (*HEADLINES, *log.main_metrics))
+    if cfg.save_to_policy:
+        files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
+        add_files(find_policy(run.source), files)
+    return values
 
 
 class SkillRun(Run):
@@ -340,15 +382,12 @@ class SkillRun(Run):
         """Return an environment of `count` robots that start with WALK, and move the policies to its device.
 
         The robot has the overlay (changed parameters) of the policies' training. scene: further arguments of `Env`,
-        e.g. `block`. Raises PolicyError: policies were trained with different overlays, or the tasks do not fit.
+        e.g. `block`. Raises PolicyError: the policies have different overlays; InputError: the tasks do not fit.
         """
         from jumper_warp.envs.env import Env
 
         walk, *jumps = (self.conditions.applied(task) for task in self.tasks)
-        try:
-            self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
-        except InputError as error:
-            raise PolicyError(str(error)) from error
+        self.skills, handovers = skills_and_handovers(walk, tuple(jumps))
         robots = {name: recipe.robot for name, recipe in zip(self.names, self.recipes, strict=True)}
         settings = self.conditions.env_settings(shared_robot(robots, self.conditions))
         env = Env(self.skills, count, skill=WALK, handovers=handovers, **settings, **scene)

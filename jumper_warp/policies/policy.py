@@ -133,12 +133,9 @@ class Policy(nn.Module):
         """Return the recipe of the policy's training, from its configuration; see `Recipe.from_json`.
 
         modules: the user's, in which functions from outside the project are looked up.
-        Raises PolicyError: the configuration has no recipe of this version, or its observation is another one.
+        Raises TaskError: the configuration has no recipe of this version; PolicyError: its observation is another one.
         """
-        try:
-            recipe = Recipe.from_json(self.config, modules, complete=False)
-        except TaskError as error:
-            raise PolicyError(str(error)) from error
+        recipe = Recipe.from_json(self.config, modules, complete=False)
         if recipe.task.observation_names != self.interface.observation_names:
             raise PolicyError("the policy's observation differs from that of its task in this version")
         return recipe

@@ -1,4 +1,4 @@
-"""Checkpoint files: atomic writes, SHA-256 checksums, and loading without executing code."""
+"""Checkpoint files: atomic writes, SHA-256 checksums, loading without executing code, choice of one to resume."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from jumper_warp.rl.run_names import CHECKPOINTS, MANIFEST, seed_folders
+from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW, TrainCfg
+from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, MANIFEST, SEED, newest, seed_folders
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, existing_file, read_file, read_json, write_atomically
 
@@ -113,6 +114,56 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
         except CheckpointError as error:
             skipped.append(str(error))
     raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *skipped]))
+
+
+def find_checkpoints(cfg: TrainCfg) -> list[Checkpoint]:
+    """Load and return the checkpoints that `TrainCfg.resume` selects: one, or one of each seed that was not frozen.
+
+    Those of several seeds are of the same iteration. Empty: start a new run. Raises CheckpointError.
+    """
+    if not cfg.resume:
+        return []
+    path = Path(cfg.resume)
+    if cfg.resume in (LATEST, LATEST_OR_NEW):
+        runs = cfg.log_root / cfg.task
+        found = runs.glob(f"*/{CHECKPOINTS}/{MANIFEST}"), runs.glob(f"*/{SEED}*/{CHECKPOINTS}/{MANIFEST}")
+        run = newest([*(file.parents[1] for file in found[0]), *(file.parents[2] for file in found[1])])
+        if run is None and cfg.resume == LATEST_OR_NEW:
+            return []
+        if run is None:
+            raise CheckpointError(f"{runs}: no run to resume")
+        path = run
+    if folders := seed_folders(path):
+        return _common_checkpoints(path, [folder for folder in folders.values() if not (folder / FROZEN).exists()])
+    folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
+    if not (folder / MANIFEST).is_file():
+        reason = "no run to resume" if path.exists() else "no such file or folder, no run to resume"
+        raise CheckpointError(f"{path}: {reason}; pass a run's folder, one of its checkpoints, or latest")
+    if path.suffix == ".pt":
+        return [Checkpoint(path, load_checkpoint(path), [], newest_name(folder))]
+    return [latest_checkpoint(folder)]
+
+
+def _common_checkpoints(run: Path, folders: list[Path]) -> list[Checkpoint]:
+    """Return the checkpoints of the last iteration that the folders of all seeds have. Raises CheckpointError."""
+    names = [checkpoint_names(folder / CHECKPOINTS) for folder in folders]
+    skipped: list[str] = []
+    for name in sorted(set.intersection(*map(set, names)), reverse=True) if names else []:
+        paths = [folder / CHECKPOINTS / name for folder in folders]
+        try:
+            states = [load_checkpoint(path) for path in paths]
+        except CheckpointError as error:
+            skipped.append(str(error))
+            continue
+        parts = zip(paths, states, names, strict=True)
+        return [Checkpoint(path, state, skipped, saved[-1]) for path, state, saved in parts]
+    raise CheckpointError("; ".join([f"{run}: its seeds have no usable checkpoint of the same iteration", *skipped]))
+
+
+def check_unchanged(checkpoint: Checkpoint) -> None:
+    """Raise CheckpointError if another process saved a checkpoint in the folder after `checkpoint` was loaded."""
+    if newest_name(checkpoint.path.parent) != checkpoint.newest:
+        raise CheckpointError(f"{checkpoint.path.parent}: another process has saved a checkpoint; resume again")
 
 
 def checkpoint_names(folder: Path) -> list[str]:

@@ -21,11 +21,6 @@ class TrainingClock:
         self.seconds = 0.0  # of the run before this process [s]
         self._begin: float | None = None  # time at which the run would have started without interruption
 
-    @property
-    def started(self) -> bool:
-        """Whether `start` was called."""
-        return self._begin is not None
-
     def start(self, device: torch.device) -> None:
         """Start counting the training time, after synchronising with the device."""
         if device.type == "cuda":

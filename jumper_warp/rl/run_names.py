@@ -16,6 +16,7 @@ ZONED = 31  # Number of characters of the time in a folder's name
 CHECKPOINTS = "checkpoints"  # Folder in a run's folder that holds its checkpoints
 MANIFEST = "manifest.json"  # File of checksums and scores in CHECKPOINTS
 SEED = "seed_"  # Begin of the folder's name of a seed
+FROZEN = "frozen.txt"  # File in the folder of a seed whose training ended early, with the reason
 
 
 def run_name(microseconds: int, name: str | None = None) -> str:

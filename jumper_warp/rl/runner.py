@@ -9,10 +9,10 @@ from typing import Protocol
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl import distributed, resume, seeds
+from jumper_warp.rl import distributed, seeds
 from jumper_warp.rl.actor_init import ActorInit
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import Checkpoint
+from jumper_warp.rl.checkpoint import Checkpoint, check_unchanged, find_checkpoints
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import TrainingConsole
 from jumper_warp.rl.run_folder import INTERRUPTED, TrainResult, new_folder
@@ -68,7 +68,7 @@ def train(
         rank = distributed.init_distributed(cfg.device, cfg.threads)
         cleanup.callback(leave_process_group)
         cfg.check_processes(rank.size)
-        checkpoints = checkpoints or resume.find_checkpoints(cfg)
+        checkpoints = checkpoints or find_checkpoints(cfg)
         if not checkpoints and bool(cfg.init_policy) != (actor_init is not None):
             raise InputError("init_policy and actor_init, which is made from it, must be passed together")
         console = TrainingConsole(cfg, quiet=rank.index > 0)
@@ -88,7 +88,7 @@ def train(
             """Return a training, with its folder locked until the end."""
             if checkpoint is not None and each.index == 0:
                 cleanup.enter_context(write_lock(checkpoint.path.parent.parent))
-                resume.check_unchanged(checkpoint)
+                check_unchanged(checkpoint)
             stream = DeviceStream(each.device) if folder else nullcontext()
             with stream:
                 env = make_env(cfg.num_envs // each.size, (cfg.seed + 1000 * each.index) % 2**31, each.device)

@@ -23,9 +23,10 @@ from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingConsole, TrainingLog
 from jumper_warp.rl.run_folder import CONFIG, TrainResult, full_config, new_folder, report_non_finite, write_config
-from jumper_warp.rl.run_names import CHECKPOINTS, SEED
+from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.sources import changed_sources
 
 PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
 """Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
@@ -93,24 +94,26 @@ class TrainingRun:
         Raises CheckpointError: it does not fit the settings.
         """
         path, state, skipped, _ = checkpoint
-        changed = resume.changed_settings(state, self.config)
-        lines = [f"{name} {change}" for name, change in changed.items()]
-        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *lines]
-        self.notes += resume.changed_user_files(state, self.config)
+        lines: list[str] = []
         try:
+            saved = json.loads(state["config"])
+            changed = resume.changed_settings(saved, self.config)
+            lines = [f"{name} {change}" for name, change in changed.items()]
             resume.check_changes(changed, self.config)
+            sources = changed_sources(saved["sources"], self.config["sources"])
+            self.config["train"]["init_policy"] = saved["train"]["init_policy"]
             local = resume.rank_state(state, self.rank)
+            resume.set_random_state(local["rng"], self.ppo.generator)
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
             self.clock.seconds = float(state.get("seconds", 0.0))
-            resume.set_random_state(local["rng"], self.ppo.generator)
         except DECODE_ERRORS as error:
             suffix = f" ({', '.join(lines)})" if lines else ""
             raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
+        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *lines, *sources]
         if "ppo.lr" in changed:
             self.ppo.lr.fill_(self.cfg.ppo.lr)
         self.iteration = state["iteration"]
-        self.config["train"]["init_policy"] = resume.saved_init_policy(state)
         return path.parent.parent
 
     @contextmanager
@@ -170,7 +173,7 @@ class TrainingRun:
         if is_last and self.failure and not self._is_single:
             log.print_line(f"frozen at iteration {self.iteration}: {self.failure}")
             with suppress(OSError):
-                (self.folder / resume.FROZEN).write_text(f"iteration {self.iteration}: {self.failure}\n")
+                (self.folder / FROZEN).write_text(f"iteration {self.iteration}: {self.failure}\n")
         elif is_last and not self.failure and self._is_single:
             log.print_line(f"ended by {self.reason(stop)}")
         if (is_last or saves) and self._is_finite:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -20,25 +19,20 @@ from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Gains, Loop, Motor, Robo
 from jumper_warp.robot.urdf import UrdfReader
 from jumper_warp.utils.assets import ASSETS
 
-__all__ = [
-    "DEFAULT_DESCRIPTION", "LEGS", "MOTOR_JOINTS", "RobotDescription", "knee_angles", "leg_dimensions",
-    "load_description",
-]  # fmt: skip
+__all__ = ["LEGS", "MOTOR_JOINTS", "RobotDescription", "knee_angles", "leg_dimensions", "load_description"]
 
-DEFAULT_DESCRIPTION = ASSETS / "jumper" / "jumper.json"
-
+FOLDER = ASSETS / "jumper"  # Folder of the description
 RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 @functools.cache
-def load_description(path: Path = DEFAULT_DESCRIPTION) -> RobotDescription:
-    """Read a robot description, by default the project's own: a JSON file and the URDF that it names.
+def load_description() -> RobotDescription:
+    """Read the project's robot description: a JSON file and the URDF that it names.
 
     Each is read once. Their values are not checked here; tests check the project's files.
     """
-    path = Path(path)
-    table = json.loads(path.read_text(encoding="utf-8"))
-    urdf = UrdfReader(path.parent / table["urdf"])
+    table = json.loads((FOLDER / "jumper.json").read_text(encoding="utf-8"))
+    urdf = UrdfReader(FOLDER / table["urdf"])
     types = {name: motor_type(name, constants) for name, constants in table["motor_types"].items()}
     loops = (
         Loop(
@@ -54,8 +48,6 @@ def load_description(path: Path = DEFAULT_DESCRIPTION) -> RobotDescription:
         for name, pose in table["poses"].items()
     }
     description = RobotDescription(
-        path=path,
-        urdf_path=urdf.file,
         urdf=urdf.text,
         links=urdf.links(),
         joints=urdf.joints(),

@@ -122,8 +122,6 @@ class Hull:
 class RobotDescription:
     """Description of a robot: links, joints, loops, motors and poses; `dataclasses.replace` returns a changed copy."""
 
-    path: Path  # JSON file
-    urdf_path: Path
     urdf: str  # text of the URDF
     links: tuple[Link, ...]  # 21, body first, then leg by leg
     joints: tuple[Joint, ...]  # 20 hinges, leg by leg

@@ -208,10 +208,6 @@ class TaskCfg(Copyable):
         check_gravity(self.gravity)
         check_bounds(f"{self.name}:", self, TASK_BOUNDS)
 
-    def without_margins(self) -> TaskCfg:
-        """Return a copy of the task with collision margins of 0 m, as in evaluation."""
-        return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
-
     def _check_structs(self) -> None:
         """Raise InputError unless state, reset settings and levels have Warp structs for kernels."""
         if not isinstance(self.state, Struct):

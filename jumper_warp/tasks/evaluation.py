@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal
 
 import warp as wp
@@ -34,6 +35,13 @@ class Evaluation:
     def paper(self) -> Mapping[str, float]:
         """Values in the paper of the metrics with the same keys; empty for other settings than the default ones."""
         return self.published if self == type(self)() else {}
+
+    def default_flags(self, command: Literal["evaluate", "play"]) -> Any:
+        """Return the flags of a command (see `flags`) with their defaults, which a field of the same name replaces."""
+        module, _, name = self.flags.partition(":")
+        kind = getattr(importlib.import_module(module), f"{name}{'Play' * (command == 'play')}Flags")
+        values = vars(self)
+        return kind(**{spec.name: values[spec.name] for spec in fields(kind) if spec.name in values})
 
     def prepare_task(self, task: Any) -> Any:
         """Return a copy of a `TaskCfg` with the terminations and the ground of the evaluation."""

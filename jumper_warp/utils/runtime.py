@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
+from collections.abc import Iterable
 from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
@@ -130,10 +131,10 @@ def source_versions() -> Json:
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 
 
-def versions() -> dict[str, str | None]:
-    """Return the versions of Python, this package and each of `PACKAGES`; None for one that is not installed."""
+def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str | None]:
+    """Return the versions of Python, this package and other `packages`; None for one that is not installed."""
     by_package: dict[str, str | None] = {"python": python_version(), "jumper-warp": __version__}
-    for package in PACKAGES:
+    for package in packages:
         try:
             by_package[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

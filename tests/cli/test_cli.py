@@ -10,11 +10,10 @@ from rerun.chunk import RrdReader
 from cli_helpers import curves, run
 from hold_height import hold_height
 from jumper_warp.cli import main as cli
-from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
-from jumper_warp.cli.train import parse_settings, parse_train
+from jumper_warp.cli.task_flags import flag_name, flags_of, parse_with_task, with_flags
+from jumper_warp.cli.train import TrainArgs, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.policies.policy import Policy, load_policy, save_policy
-from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.output import read_values
 from jumper_warp.viz.rerun_server import viewer_command
@@ -105,7 +104,7 @@ def test_flag_sets_each_term_parameter(name):
 
 def parsed(task, args):
     """Return a copy of the task with settings changed by --env flags."""
-    return parse_settings(Recipe(task), args)[1]
+    return parse_with_task(TrainArgs(), task, "train", args, ())[1]
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])

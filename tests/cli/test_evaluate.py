@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import write_trials
@@ -23,8 +22,8 @@ def test_jump_evaluations_check_success_after_failures():
 
 def test_flags_have_the_values_of_the_tasks_evaluation():
     evaluation = make_task("vertical-jump-mars").evaluation
-    assert default_flags(evaluation, "evaluate") == HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9))
-    assert default_flags(evaluation, "play") == HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+    assert evaluation.default_flags("evaluate") == HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9))
+    assert evaluation.default_flags("play") == HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
 
 
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():

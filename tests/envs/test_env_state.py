@@ -168,18 +168,6 @@ def test_refuses_a_state_of_another_environment_without_changes(change, message)
     assert equal(env.state_dict(), before)
 
 
-def test_a_state_of_an_earlier_version_is_restored_without_counters_and_options():
-    saved, fresh = (make_env(4, seed=1) for _ in range(2))
-    edit_episodes(fresh, phase=2, phase_steps=59)
-    fresh.step(torch.zeros((4, 12)))
-    assert fresh.skills[0].counters.termination_count.numpy().sum() == 4
-    state = saved.state_dict()
-    new = [name for name in state if "/counters." in name or name.startswith("condition.")]
-    assert len(new) == 9
-    fresh.load_state_dict({name: value for name, value in state.items() if name not in new})
-    assert equal(fresh.state_dict(), state)
-
-
 def test_every_randomised_parameter_is_restored_and_is_not_in_the_fingerprint():
     """A changed parameter changes the state; loading restores it, in the solver too."""
     env = make_env(2)

@@ -12,7 +12,6 @@ import pytest
 from columns import Z
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
-from jumper_warp.evaluation.evaluations import default_flags
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import load_task_module
@@ -47,7 +46,7 @@ def test_every_arm_changes_the_task_or_the_trainer_and_can_be_saved(file):
         same = replace(task, name=kept.task.name) == kept.task and recipe.train.ppo == kept.train.ppo
         assert same == (name == first), name
     values = {key: tuple(each) if isinstance(each, list) else each for key, each in settings["evaluation"].items()}
-    replace(default_flags(kept.task.evaluation, "evaluate"), **values)
+    replace(kept.task.evaluation.default_flags("evaluate"), **values)
     Conditions(**settings.get("conditions", {}))
 
 

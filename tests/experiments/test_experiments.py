@@ -13,11 +13,12 @@ from experiments import (
     leg_springs,
     new_reward,
     rescue,
+    solver_accuracy,
     teacher,
     template,
     walk_jump_walk,
 )  # fmt: skip
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.flags import parse
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
 from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.jumps import JumpLog
@@ -32,8 +33,7 @@ from metric_helpers import saved_metrics, values
 SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-FOLDER = Path(rescue.__file__).parent
-SCRIPTS = [path.stem for path in FOLDER.glob("*.py") if "run_script(main, Args)" in path.read_text()]
+SCRIPTS = [file.stem for file in Path(rescue.__file__).parent.glob("*.py") if "(main, Args)" in file.read_text()]
 
 
 @pytest.mark.parametrize("script", sorted(SCRIPTS))
@@ -163,6 +163,13 @@ def test_training_benchmark_reports_rates_of_solver_environment_and_both_trainer
     assert values == read_values(tmp_path)
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     assert min(*rates, values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"], values["ppo_steps_per_s_eager"]) > 0.0
+
+
+def test_errors_of_a_solver_decrease_with_finer_steps(tmp_path):
+    args = solver_accuracy.Args(num_robots=2, jumper=(1, 4), mujoco=(), out=tmp_path, device="cpu")
+    values = solver_accuracy.main(args)
+    assert 0.0 < values["jumper_4_apex_mm"] < 0.8 * values["jumper_1_apex_mm"] < 2.0
+    assert values["jumper_1_gap_mm"] < 0.001
 
 
 @pytest.mark.parametrize("settings", [{"envs": [2]}, {"envs": [32], "solvers": ["jumper"], "threads": [1, 2]}])

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from jumper_warp.policies.catalog import newest_run
-from jumper_warp.rl.checkpoint import MANIFEST, load_checkpoint
+from jumper_warp.rl.checkpoint import MANIFEST, find_checkpoints, load_checkpoint
 from jumper_warp.rl.learner import Learner
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.resume import FROZEN, find_checkpoints
-from jumper_warp.rl.run_names import seed_folders
+from jumper_warp.rl.run_names import FROZEN, seed_folders
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, equal, free_port, push_cfg, train_seeds_rank

@@ -12,11 +12,10 @@ from tensordict import TensorDict
 
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
-from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
+from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, find_checkpoints, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Scores, TrainingConsole
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.rl.runner import CHECKPOINTS, train

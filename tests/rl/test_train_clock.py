@@ -7,10 +7,9 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from jumper_warp.rl.checkpoint import save_checkpoint
+from jumper_warp.rl.checkpoint import find_checkpoints, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import TrainingConsole
-from jumper_warp.rl.resume import find_checkpoints
 from jumper_warp.rl.runner import CHECKPOINTS, iterate, train
 from jumper_warp.rl.training_run import TrainingRun
 from test_train import final_state
