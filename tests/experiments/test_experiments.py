@@ -169,7 +169,6 @@ def test_errors_of_a_solver_decrease_with_finer_steps(tmp_path):
     args = solver_accuracy.Args(num_robots=2, jumper=(1, 4), mujoco=(), out=tmp_path, device="cpu")
     values = solver_accuracy.main(args)
     assert 0.0 < values["jumper_4_apex_mm"] < 0.8 * values["jumper_1_apex_mm"] < 2.0
-    assert values["jumper_1_gap_mm"] < 0.001
 
 
 @pytest.mark.parametrize("settings", [{"envs": [2]}, {"envs": [32], "solvers": ["jumper"], "threads": [1, 2]}])
