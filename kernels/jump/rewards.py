@@ -14,7 +14,7 @@ go without further forces: it rewards a good takeoff at once.
 
 import warp as wp
 
-from ..mdp.rewards import phi, posture_offset, psi, square_sum
+from ..mdp.rewards import phi, posture_offset, psi, root, square_sum
 from ..mdp.view import RobotView, angle_from_level, base_deceleration
 from .phase import estimated_apex, landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting, wanted_squat
@@ -150,7 +150,7 @@ def joint_symmetry(
             total += angle
             total_sq += angle * angle
     variance = total_sq / 8.0 - total * total / 64.0
-    return phi(variance, std_variance) * phi(wp.sqrt(lateral_sq), std_lateral) * waiting_weight(state, waiting_scale)
+    return phi(variance, std_variance) * phi(root(lateral_sq), std_lateral) * waiting_weight(state, waiting_scale)
 
 
 @wp.func
@@ -266,7 +266,7 @@ def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_
         if m % 3 != 0 and (m / 3) % 2 == 0:  # transversal motors of left legs; the right leg is 3 motors later
             difference = robot.angle[m] - robot.angle[m + 3]
             total += difference * difference
-    return phi(wp.sqrt(total / 4.0), std) * waiting_weight(state, waiting_scale)
+    return phi(root(total / 4.0), std) * waiting_weight(state, waiting_scale)
 
 
 @wp.func

@@ -25,6 +25,19 @@ def psi(x: float, s: float) -> float:
 
 
 @wp.func
+def root(square: float) -> float:
+    """Return the square root, with a gradient of 0 at 0, in place of infinity: a size of 0 is a minimum."""
+    return wp.sqrt(square)
+
+
+@wp.func_grad(root)
+def root_adjoint(square: float, adj_ret: float):
+    """Add the gradient of `root` w.r.t. its argument to `wp.adjoint`."""
+    if square > 0.0:
+        wp.adjoint[square] += 0.5 * adj_ret / wp.sqrt(square)
+
+
+@wp.func
 def square_sum(v: vec12) -> float:
     """Return the sum of squares of a vector of 12 motor values."""
     return wp.dot(v, v)
@@ -39,7 +52,7 @@ def posture_offset(robot: RobotView, shift: float) -> float:
         if m % 3 != 0:
             offset = offset - shift
         total += offset * offset
-    return wp.sqrt(total / 12.0)
+    return root(total / 12.0)
 
 
 @wp.func

@@ -8,7 +8,7 @@ positive away from the leg's other thigh.
 
 import warp as wp
 
-from ..mdp.rewards import phi, torque_sign_changes  # noqa: F401  (saved configurations name it here)
+from ..mdp.rewards import phi, root, torque_sign_changes  # noqa: F401  (saved configurations name it here)
 from ..mdp.view import RobotView
 from .state import VelocityState, velocity_error
 
@@ -85,7 +85,7 @@ def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: 
         if m % 3 != 0:
             offset = robot.angle[m] - robot.default_angle[m] - shift
             total += offset * offset
-    return phi(wp.sqrt(total / 8.0), std)
+    return phi(root(total / 8.0), std)
 
 
 @wp.func
