@@ -285,13 +285,13 @@ def film_rescues(args: Args, jobs: list[Job], results: dict, folder: Path) -> No
     for name in args.changes:
         goals = [job.goals for job in jobs if (job.name, job.mode) == (name, "known")]
         saved = np.concatenate(goals)[results[name, "known"][0]] if goals else np.zeros(0)
-        recordings = {}
-        for mode, label in {"policy": f"{name.replace('_', ' ')}: policy", "known": "controller"}.items():
-            goal = saved[len(saved) // 2 :][:1]
-            if len(goal):
-                recordings[label] = Robots(CHANGES[name], args).rescue(mode, goal, film=True).recording
-        if recordings:
-            write_film(side_by_side(recordings), folder / f"rescue_{name}.webp", size=(480, 270), fps=15.0)
+        if len(saved):
+            goal = saved[[len(saved) // 2]]
+            labels = {"policy": f"{name.replace('_', ' ')}: policy", "known": "controller"}
+            robots = Robots(CHANGES[name], args)
+            made = {label: robots.rescue(mode, goal, film=True).recording for mode, label in labels.items()}
+            films = {label: film for label, film in made.items() if film}
+            write_film(side_by_side(films), folder / f"rescue_{name}.webp", size=(480, 270), fps=15.0)
 
 
 def main(args: Args) -> dict:
