@@ -183,7 +183,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     rows = first_seed(policy)
     wide = PAGES["wide"][kind_of(task)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
-    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
+    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
     trials = trials_by_title({title: rows[name] for name, (title, _) in CONDITIONS.items() if name in rows})
     note = f"Trials: {trials}. Commands: {nominal.values['commands']}.\n"
