@@ -181,7 +181,7 @@ def main_table(policy: str, task: TaskCfg) -> str:
 def all_conditions(policy: str, task: TaskCfg) -> str:
     """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
     rows = first_seed(policy)
-    wide = PAGES["wide"][kind_of(task)]
+    wide = [column for column in PAGES["wide"][kind_of(task)] if cell(column, rows["nominal"].metrics)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
