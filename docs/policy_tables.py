@@ -189,7 +189,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     note = f"Trials: {trials}. Commands: {nominal.values['commands']}.\n"
     note += f"Commands in training: {trained_on(task, nominal.values)}.\n"
     reasons = [
-        f"Not measured: {title}, because {reason}.\n"
+        f"Not measured: *{title}*, because {reason}.\n"
         for name, (title, _) in CONDITIONS.items()
         if (reason := undefined(task, name))
     ]
