@@ -135,6 +135,13 @@ def trials_of(row: Row) -> str:
     return f"{max(value.trials or 0 for value in row.metrics.values()):,}"
 
 
+def trials_by_title(rows: Mapping[str, Row]) -> str:
+    """Format numbers of trials: the number of the first row, and other numbers after the last part of their title."""
+    usual = trials_of(next(iter(rows.values())))
+    others = {title.split(", ")[-1]: trials_of(row) for title, row in rows.items() if trials_of(row) != usual}
+    return usual + "".join(f"; {title}: {trials}" for title, trials in others.items())
+
+
 def goals_in_range(success: MetricValue) -> str:
     """Return the range of commands, such as "0.5 to 1.1 m", over which a success rate was taken."""
     return str(success.over).partition("goals of ")[2]
@@ -163,24 +170,26 @@ def main_table(policy: str, task: TaskCfg) -> str:
         on_robot = " / ".join(filter(None, (cell(line, metrics) for metrics in robot.values())))
         lines.append([*cells, on_robot] if robot else cells)
     nominal = rows["nominal"]
-    note = f"Each column is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}"
+    note = f"Trials: {trials_by_title({title: rows[name] for name, title in SHOWN.items() if name in rows})}. "
+    note += f"Commands: {nominal.values['commands']}"
     if kind_of(task) == "height":
-        note += ", in range: " + goals_in_range(nominal.metrics["in_range_success_rate"])
-    note += f".\n{together.capitalize()}: {' / '.join(robot)}" if robot else ""
+        note += "; *in range*: " + goals_in_range(nominal.metrics["in_range_success_rate"])
+    note += f".\nColumn *{together}*: {' / '.join(robot)}" if robot else ""
     return markdown(["", *titles, *([together] if robot else [])], lines) + f"\n{note}.\n"
 
 
 def all_conditions(policy: str, task: TaskCfg) -> str:
     """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
     rows = first_seed(policy)
-    wide = PAGES["wide"][kind_of(task)]
+    wide = [column for column in PAGES["wide"][kind_of(task)] if cell(column, rows["nominal"].metrics)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
-    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
+    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
-    note = f"Each row is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}.\n"
-    note += f"Commands of the training: {trained_on(task, nominal.values)}.\n"
+    trials = trials_by_title({title: rows[name] for name, (title, _) in CONDITIONS.items() if name in rows})
+    note = f"Trials: {trials}. Commands: {nominal.values['commands']}.\n"
+    note += f"Commands in training: {trained_on(task, nominal.values)}.\n"
     reasons = [
-        f"Not measured: {title}, since {reason}.\n"
+        f"Not measured: *{title}*, because {reason}.\n"
         for name, (title, _) in CONDITIONS.items()
         if (reason := undefined(task, name))
     ]
