@@ -204,7 +204,7 @@ def randomisation() -> str:
     """Return the ranges of domain randomisation for jumping and walking."""
     jumping, walking = RandomizationCfg(), RandomizationCfg.walking()
     return table(
-        "parameter | field | jumping | walking | unit",
+        "parameter | setting | jumping tasks | walking tasks | unit",
         [
             (meaning, f"`{field}`", pair(getattr(jumping, field)), pair(getattr(walking, field)), unit)
             for field, (meaning, unit) in RANDOMISED.items()
