@@ -2,7 +2,7 @@
 
     --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
-They are derived from the task. The flag of a term's number is its dotted name (`jumper_warp.tasks.params`), without the
+They are derived from the task. The flag of a term's number is its dotted name (`jumper_warp.tasks.terms`), without the
 term's name in a section with one term, as `--env.curriculum.tolerance`; other settings have the name of their field.
 """
 

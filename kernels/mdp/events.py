@@ -1,6 +1,6 @@
 """Kernel that runs a task's events (changes of robot parameters): at startup, at resets and at intervals.
 
-Events are domain randomisation: masses, friction, gains, latency, pushes. `TermSlot`s (`jumper_warp.tasks.params`) name
+Events are domain randomisation: masses, friction, gains, latency, pushes. `TermSlot`s (`jumper_warp.tasks.terms`) name
 an event's function and the places of its numbers in `p`, so that a number can change without another kernel.
 """
 
