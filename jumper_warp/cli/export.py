@@ -112,10 +112,9 @@ def export_page(cfg: ExportCfg, folder: Path) -> Path:
     Raises InputError or PolicyError: see `write_page`.
     """
     from jumper_warp.live.site import write_page
-    from jumper_warp.policies.catalog import newest_run
     from jumper_warp.policies.policy import Policy
 
-    path = write_page(folder, [Policy.load(newest_run(source), newest=cfg.newest) for source in cfg.sources])
+    path = write_page(folder, [Policy.load(source, newest=cfg.newest) for source in cfg.sources])
     print(path)
     return path
 

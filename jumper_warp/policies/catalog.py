@@ -74,6 +74,22 @@ def find_policy(name: str | Path) -> Path:
     return path
 
 
+def open_source(source: str | Path) -> tuple[Path, tuple[Json, bytes] | None]:
+    """Return the folder of a policy, and its verified configuration and ONNX file; None for a run or a checkpoint.
+
+    source: as `find_policy` and `newest_run` take it. Raises PolicyError as `find_policy` and `read_files`, and
+    CheckpointError as `newest_run`.
+    """
+    source = newest_run(source)
+    if is_run(source):
+        return Path(source), None
+    folder = find_policy(source)
+    files = read_files(folder)
+    config = parse_object(folder / CONFIG, files[CONFIG])
+    check_version(folder / CONFIG, config)
+    return folder, (config, files[ONNX])
+
+
 def _own_policy(name: Path) -> Path | None:
     """Return the folder of the project's policy of this name (- counts as _), None: there is none."""
     folder = POLICIES / str(name).replace("-", "_")

@@ -114,18 +114,15 @@ class Policy(nn.Module):
         rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
         Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
         """
-        source = catalog.newest_run(source)
-        if catalog.is_run(source):
-            return _policy_of_run(Path(source), newest)
-        folder = catalog.find_policy(source)
-        files = catalog.read_files(folder)
-        config = catalog.parse_object(folder / catalog.CONFIG, files[catalog.CONFIG])
-        catalog.check_version(folder / catalog.CONFIG, config)
+        path, saved = catalog.open_source(source)
+        if saved is None:
+            return _policy_of_run(path, newest)
+        config, weights = saved
         try:
             spec = PolicyInterface.from_json(config.get("interface"))
-            tensors = tensors_from_onnx(files[catalog.ONNX], spec, config)
+            tensors = tensors_from_onnx(weights, spec, config)
         except PolicyError as error:
-            raise PolicyError(f"{folder}: {error}") from error
+            raise PolicyError(f"{path}: {error}") from error
         layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(spec.sizes) - 1)]
         return cls(layers, tensors["normaliser.mean"], tensors["normaliser.std"], spec, config)
 
