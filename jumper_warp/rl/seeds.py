@@ -11,7 +11,6 @@ from pathlib import Path
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import Checkpoint
 from jumper_warp.rl.run_folder import TrainResult
-from jumper_warp.rl.run_names import SEED
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean
 
@@ -21,9 +20,8 @@ def trainings(cfg: TrainCfg, checkpoints: Sequence[Checkpoint]) -> list[tuple[Tr
 
     Raises InputError: a seed is not in cfg.seeds, or the checkpoints are of a single training.
     """
-    names = [checkpoint.path.parents[1].name for checkpoint in checkpoints]
-    found = [int(name.removeprefix(SEED)) for name in names if name.startswith(SEED)]
-    if len(found) < len(names) or not set(found) <= set(cfg.seeds):
+    found = [checkpoint.seed for checkpoint in checkpoints if checkpoint.seed is not None]
+    if len(found) < len(checkpoints) or not set(found) <= set(cfg.seeds):
         run = f"seeds {', '.join(map(str, sorted(found)))}" if found else "one seed"
         raise InputError(f"the run to continue has {run}, got seeds {', '.join(map(str, cfg.seeds))}")
     pairs = zip(found, checkpoints, strict=True) if found else ((seed, None) for seed in cfg.seeds)
