@@ -17,7 +17,7 @@ def test_help_of_train_fits_60_lines(capsys, monkeypatch, task):
 
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
 def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, capsys):
-    recipe, _ = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
+    recipe = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])[0]
     assert (recipe.train.num_envs, recipe.randomize, recipe.noise) == (8, False, True)
     line = capsys.readouterr().err
     assert line.startswith("preset laptop: --no-randomize --history 1 --ppo.hidden 128 64 64 --")

@@ -97,7 +97,7 @@ def test_solver_of_the_run_is_restored_and_missing_settings_have_defaults(run):
     del saved["env"]["noise"], saved["env"]["randomize"]
     saved["env"]["solver"] = "SolverMuJoCo"
     save_checkpoint(path.parent, state | {"config": json.dumps(saved)})
-    recipe, _ = parse_train(["vertical-jump", "--resume", str(run)])
+    recipe = parse_train(["vertical-jump", "--resume", str(run)])[0]
     assert (recipe.solver, recipe.noise, recipe.randomize, recipe.task.gravity) == ("mujoco", True, True, 3.71)
     assert parse_train(["vertical-jump", "--resume", str(run), "--solver", "jumper"])[0].solver == "jumper"
 
