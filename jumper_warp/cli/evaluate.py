@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from jumper_warp.cli.flags import list_flags, option_of, wants_help
 from jumper_warp.cli.flags import parse as parse_flags
-from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.utils.errors import suggestion
 from jumper_warp.utils.files import read_json
@@ -59,17 +58,17 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def check_suite_flags(task: TaskCfg, args: Sequence[str]) -> None:
     """Raise UsageError if args, without --suite, have a flag that only test suites of the task's policies have."""
-    from jumper_warp.evaluation.conditions import Conditions
     from jumper_warp.evaluation.run import EvaluateCfg
     from jumper_warp.evaluation.suites import suites_for
-    from jumper_warp.utils.summary import PrintFlags
 
-    kinds = (EvaluateCfg, type(task.evaluation.default_flags("evaluate")), Conditions, PrintFlags)
-    known = {field.name for kind in kinds for field in fields(kind)}
-    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
-        name = flag[2:].replace("-", "_")
-        of = [suite for suite, kind in suites_for(task).items() if name in {field.name for field in fields(kind)}]
-        if of and name not in known:
+    def flags_of(settings: Any) -> set[str]:
+        """Return the flags of a settings dataclass, with leading dashes."""
+        return {f"--{flag.name}" for flag in list_flags(settings, described=False)}
+
+    known = flags_of(EvaluateCfg(task.evaluation.default_flags("evaluate")))
+    for flag in map(option_of, args):
+        of = [suite for suite, kind in suites_for(task).items() if flag in flags_of(kind)]
+        if of and flag not in known:
             raise UsageError(f"{flag} needs a test suite: add {SUITE} {' or '.join(of)}")
 
 
