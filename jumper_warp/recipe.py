@@ -95,18 +95,6 @@ class Recipe:
         if task_from_json(json.loads(json.dumps(task_to_json(task))), _imported()) != task:
             raise TaskError(f"{task.name} differs from the original after it is saved as JSON and loaded")
 
-    def tested_task(self, randomize: bool, rewards: bool = False) -> TaskCfg:
-        """Return the task of a test: without critic, with rewards and events only if asked for and if randomised.
-
-        Raises TaskError: events are needed, and their functions were not found.
-        """
-        if randomize and self.missing:
-            raise TaskError(self.missing)
-        observations = dataclasses.replace(self.task.observations, critic=())
-        events = self.task.events if randomize else ()
-        kept = self.task.rewards if rewards else ()
-        return dataclasses.replace(self.task, rewards=kept, observations=observations, events=events)
-
 
 def _imported() -> list[ModuleType]:
     """Return all imported modules, which include those of every registered task's functions."""

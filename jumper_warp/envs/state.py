@@ -44,7 +44,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Restore the arrays of a saved state of an environment; `Env.load_state_dict` updates what follows from them.
+    """Restore the arrays of a saved state of an environment, and the terms' numbers that `Env.set` had changed.
 
     Values that are not finite are restored too: without `auto_reset` a diverged world keeps them.
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
@@ -88,6 +88,8 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         array.assign(wp.array(saved[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
+    for skill in env.skills:
+        skill.params.restore()
 
 
 def _conditions(env: Stages) -> dict[str, torch.Tensor]:

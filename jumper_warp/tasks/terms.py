@@ -68,7 +68,8 @@ class Term(Copyable):
         self.func = func
         self.name = name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
-        self._check_types(f"{place_of(func)}: {where}")
+        if reason := self._misfit():
+            raise InputError(f"{place_of(func)}: {where}: {reason}")
         python: Any = func.func
         params = list(inspect.signature(python).parameters.values())[len(self._leading()) :]
         known = self.settings | {p.name: p.default for p in params}
@@ -97,18 +98,17 @@ class Term(Copyable):
             self.options[key] = bool(self.options[key])
         self.num_params = len(params)
 
-    def _check_types(self, where: str) -> None:
-        """Raise InputError unless the function has an allowed first argument (`takes`) and result (`returns`)."""
+    def _misfit(self) -> str:
+        """Return why the function has no allowed first argument (`takes`) or result (`returns`); empty: it has both."""
         if not self._leading():
-            takes = " or ".join(kinds[0].key for kinds in self.takes)
-            raise InputError(f"{where}: the first argument of the function must be annotated {takes}")
+            return f"the first argument of the function must be annotated {' or '.join(t[0].key for t in self.takes)}"
         try:
             returned = get_type_hints(self.func.func).get("return", REQUIRED)
         except NameError as error:
-            raise InputError(f"{where}: an annotation of the function has an {error}") from None
-        if returned is not REQUIRED and not self._may_return(returned):
-            annotated = shown_type(returned)
-            raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
+            return f"an annotation of the function has an {error}"
+        if returned is REQUIRED or self._may_return(returned):
+            return ""
+        return f"the function must return {self.returned}, its annotation is {shown_type(returned)}"
 
     def _leading(self) -> tuple[object, ...]:
         """Return the types of the leading arguments, from `takes`, that fit the term's function; empty: none do."""
