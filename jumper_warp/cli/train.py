@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from jumper_warp.rl.checkpoint import Checkpoint
     from jumper_warp.rl.run_folder import TrainResult
     from jumper_warp.rl.runner import Observer
-    from jumper_warp.robot.overlay import RobotOverlay
 
 
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
@@ -86,10 +85,12 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint], TrainArg
     preset = preset_flags(name, entry, args)
     from jumper_warp.cli.task_flags import parse_with_task
     from jumper_warp.recipe import Recipe
+    from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    robot = overlay_in(args)
+    files = values_of("--robot", args)
+    robot = load_overlay(Path(files[0])) if files else None
     recipe, checkpoints = resumed(Recipe(entry.task(name, robot), entry.training(name), robot=robot), args)
     default = TrainArgs(recipe.train, recipe.solver, recipe.randomize, recipe.noise)
     parsed, task = parse_with_task(default, recipe.task, f"train {name}", [*preset, *args], SHORT_HELP)
@@ -152,19 +153,6 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
         flags += [] if switch_of(option) in given else [word]
     print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
     return flags
-
-
-def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
-    """Return the robot overlay of the flag --robot in unparsed arguments, None without it.
-
-    Raises InputError or OSError: the overlay is invalid.
-    """
-    path = values_of("--robot", args)
-    if not path:
-        return None
-    from jumper_warp.robot.overlay import load_overlay
-
-    return load_overlay(Path(path[0]))
 
 
 def flagged_ranges(args: Sequence[str]) -> set[str]:

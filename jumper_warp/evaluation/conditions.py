@@ -144,7 +144,7 @@ def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditio
     return robots[first]
 
 
-def tested_task(recipe: Recipe, randomize: bool, rewards: bool = False) -> TaskCfg:
+def evaluated_task(recipe: Recipe, randomize: bool, rewards: bool = False) -> TaskCfg:
     """Return a recipe's task for a test: without critic, with rewards only if asked for, with events if randomised.
 
     Raises TaskError: events are needed, and their functions were not found.
@@ -174,7 +174,7 @@ def env_of_recipe(
     """
     from jumper_warp.envs.env import Env
 
-    task = tested_task(recipe, conditions.randomize, rewards)
+    task = evaluated_task(recipe, conditions.randomize, rewards)
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
         return Env(task, num_envs, **conditions.env_settings(recipe.robot) | scene)

@@ -4,7 +4,7 @@ import json
 import pytest
 
 import hold_height
-from jumper_warp.evaluation.conditions import tested_task
+from jumper_warp.evaluation.conditions import evaluated_task
 from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.policies.spec import PolicyInterface, make_interface
 from jumper_warp.recipe import Recipe
@@ -54,7 +54,7 @@ def whole(config):
 
 def nominal(config):
     """Return the task in a configuration for a nominal test."""
-    return tested_task(Recipe.from_json(config, [], complete=False), randomize=False)
+    return evaluated_task(Recipe.from_json(config, [], complete=False), randomize=False)
 
 
 def test_restored_task_equals_the_saved_one(saved):
