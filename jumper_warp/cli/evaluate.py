@@ -92,17 +92,14 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
     """Return the policy, the first command-line argument; print the general help and exit with 0 if it is --help.
 
-    A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is
-    missing or another flag.
+    about: text for the help. Raises UsageError: the first argument is missing or another flag.
     """
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
     if not args or args[0].startswith("-"):
         raise UsageError(f"the policy comes first: jumper {command} POLICY [flags]")
-    from jumper_warp.policies.catalog import newest_run
-
-    return str(newest_run(args[0]))
+    return args[0]
 
 
 def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = ()) -> EvaluationRun:
@@ -114,10 +111,10 @@ def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = (
     from jumper_warp.utils.progress import phase
 
     if wants_help(args):
-        from jumper_warp.policies.catalog import CONFIG, find_policy
+        from jumper_warp.policies.catalog import CONFIG, find_policy, newest_run, run_folder
         from jumper_warp.recipe import Recipe
 
-        folder = Path(policy).parents[1] if Path(policy).suffix == ".pt" else find_policy(policy)
+        folder = run_folder(Path(policy)) if Path(policy).suffix == ".pt" else find_policy(newest_run(policy))
         return cast("Any", Recipe.from_json(read_json(folder / CONFIG, "configuration"), modules, complete=False))
     with phase(f"opening {policy}"):
         from jumper_warp.evaluation.run import EvaluationRun

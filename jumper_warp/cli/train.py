@@ -6,7 +6,7 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -99,8 +99,8 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint], TrainArg
     robot = robot or recipe.robot
     if robot is not None:
         task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
-    given = {name: getattr(parsed, name) for name in ("solver", "randomize", "noise")}
-    return Recipe(with_history(task, parsed.history), parsed.cfg, robot=robot, **given), checkpoints, parsed
+    task = with_history(task, parsed.history)
+    return Recipe(task, parsed.cfg, parsed.solver, parsed.randomize, parsed.noise, robot), checkpoints, parsed
 
 
 def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
@@ -184,10 +184,10 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     return shlex.join(["jumper", "train", *kept])
 
 
-def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:
+def report_cpu_time(cfg: TrainCfg, done: int, preset: bool) -> None:
     """Print the expected duration of a training on a CPU, unless it is short.
 
-    done: iterations before a resume; preset: whether a preset is used; presets: names of the task's presets.
+    done: iterations before a resume; preset: whether a preset is used.
     """
     from jumper_warp.rl.logger import format_duration
 
@@ -201,7 +201,7 @@ def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[st
         reason = ""
     if seconds < SHORT_TRAINING:
         return
-    names = " or ".join(f"--preset {name}" for name in presets)
+    names = "" if preset or done else " or ".join(f"--preset {name}" for name in TASKS[cfg.task].presets)
     advice = f"; settings for such a machine: {names}" if names else ""
     duration = f"{seconds / 3600.0:.0f} h" if seconds > 5400.0 else format_duration(seconds)
     print(f"without a GPU this training takes about {duration}{reason}{advice}", file=sys.stderr)
@@ -222,8 +222,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     task = recipe.task
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
-        presets = () if parsed.preset or checkpoints else find_task(task.name)[1].presets
-        report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, bool(parsed.preset), presets)
+        report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, bool(parsed.preset))
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     command = command_line(args, modules)

@@ -251,10 +251,10 @@ class EvaluationRun(Run):
         Raises PolicyError, TaskError or CheckpointError.
         """
         super().__init__()
-        self.source = source
         from jumper_warp.policies.policy import Policy
 
         self.policy = Policy.load(source)
+        self.source = self.policy.source
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
         self.trained_robot = self.recipe.robot

@@ -74,20 +74,20 @@ def find_policy(name: str | Path) -> Path:
     return path
 
 
-def open_source(source: str | Path) -> tuple[Path, tuple[Json, bytes] | None]:
-    """Return the folder of a policy, and its verified configuration and ONNX file; None for a run or a checkpoint.
+def open_source(source: str | Path) -> tuple[str | Path, Json, bytes]:
+    """Return the name or folder of a policy, and its verified configuration and ONNX file; both empty for a run.
 
-    source: as `find_policy` and `newest_run` take it. Raises PolicyError as `find_policy` and `read_files`, and
-    CheckpointError as `newest_run`.
+    source: a task's log folder becomes its newest run, see `newest_run`. Raises PolicyError as `find_policy` and
+    `read_files`, and CheckpointError as `newest_run`.
     """
     source = newest_run(source)
     if is_run(source):
-        return Path(source), None
+        return source, {}, b""
     folder = find_policy(source)
     files = read_files(folder)
     config = parse_object(folder / CONFIG, files[CONFIG])
     check_version(folder / CONFIG, config)
-    return folder, (config, files[ONNX])
+    return source, config, files[ONNX]
 
 
 def _own_policy(name: Path) -> Path | None:
