@@ -28,7 +28,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.policies.catalog import find_policy, newest_run
 
     name = str(newest_run(policy))
-
     if Path(name).suffix != ".pt":
         find_policy(name)  # a misspelt name is reported before PyTorch is imported
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
