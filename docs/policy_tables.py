@@ -46,7 +46,10 @@ SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
               "velocity": "paper, robot, commands by a person"}  # fmt: skip
 """Words for `Evaluation.paper` by `Evaluation.kind`."""
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
-KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
+BOTH = [metric for metric in HEIGHT_METRICS if metric in PLACE_METRICS]
+KEYS = {"jumps": BOTH, "heights": [metric for metric in HEIGHT_METRICS if metric not in BOTH],
+        "places": [metric for metric in PLACE_METRICS if metric not in BOTH],
+        "walks": VELOCITY_METRICS, "turns": TURN_METRICS}  # fmt: skip
 POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
 RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else that in range
 ERRORS = {
