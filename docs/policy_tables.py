@@ -59,6 +59,7 @@ ERRORS = {
     "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
 }
 """Key of the error, factor and format by kind."""
+COMMANDED = {"velocity": " (ahead, left, yaw)"}  # Names of the components of a command by kind
 MEASURED: dict[str, Json] = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))["tables"]
 ARMS = {"full": "full", "no_initialisation": "no initialisation", "no_estimates": "no estimates",
         "no_curriculum": "no curriculum"}  # fmt: skip
@@ -174,7 +175,7 @@ def main_table(policy: str, task: TaskCfg) -> str:
         lines.append([*cells, on_robot] if robot else cells)
     nominal = rows["nominal"]
     note = f"Trials: {trials_by_title({title: rows[name] for name, title in SHOWN.items() if name in rows})}. "
-    note += f"Commands: {nominal.values['commands']}"
+    note += f"Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}"
     if kind_of(task) == "height":
         note += "; *in range*: " + goals_in_range(nominal.metrics["in_range_success_rate"])
     note += f".\nColumn *{together}*: {' / '.join(robot)}" if robot else ""
@@ -189,7 +190,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
     trials = trials_by_title({title: rows[name] for name, (title, _) in CONDITIONS.items() if name in rows})
-    note = f"Trials: {trials}. Commands: {nominal.values['commands']}.\n"
+    note = f"Trials: {trials}. Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}.\n"
     note += f"Commands in training: {trained_on(task, nominal.values)}.\n"
     reasons = [
         f"Not measured: *{title}*, because {reason}.\n"
@@ -215,17 +216,9 @@ def test_table(name: str) -> str:
 
 
 def key_table(name: str) -> str:
-    """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
-    lines = [
-        [
-            f"`{metric.key}`",
-            "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
-            metric.statistic.__name__,
-            metric.over,
-        ]
-        for metric in KEYS[name]
-    ]
-    return markdown(("key", "unit", "statistic", "over"), lines)
+    """Return a table of an evaluation's metrics: key, statistic and trials that count; name: of KEYS."""
+    lines = [[f"`{metric.key}`", metric.statistic.__name__, metric.over] for metric in KEYS[name]]
+    return markdown(("key", "statistic", "over"), lines)
 
 
 def measured_table(name: str) -> str:
