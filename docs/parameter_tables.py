@@ -36,7 +36,7 @@ BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.
 TASKS = (
     "vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "vertical-jump-standing", "horizontal-jump-standing",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
-    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+    "velocity-flat", "velocity-rough", "velocity-mars", "velocity-trot", "attitude",
 )  # fmt: skip
 PAPER, CAD, CONFIG = "paper", "CAD export", "authors' configuration"
 RANDOMISED = {
