@@ -36,7 +36,7 @@ BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.
 TASKS = (
     "vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "vertical-jump-standing", "horizontal-jump-standing",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
-    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+    "velocity-flat", "velocity-rough", "velocity-mars", "velocity-trot", "attitude",
 )  # fmt: skip
 PAPER, CAD, CONFIG = "paper", "CAD export", "authors' configuration"
 RANDOMISED = {
@@ -45,12 +45,12 @@ RANDOMISED = {
     "base_mass": ("mass added to the base", "kg"),
     "link_mass": ("factor on mass and inertia, per leg link", "1"),
     "com_shift": ("shift of the base's centre of mass, per axis", "m"),
-    "gains": ("factor on kp and on kd, per motor", "1"),
+    "gains": ("factor on kp and kd, per motor", "1"),
     "no_load_speed": ("factor on the no-load speed, per motor", "1"),
     "cutoff_speed": ("factor on the cutoff speed, per motor", "1"),
     "motor_friction": ("Coulomb friction, per motor", "N m"),
     "armature": ("factor on the armature, per motor", "1"),
-    "joint_offset": ("sensor error, per motor", "deg"),
+    "joint_offset": ("offset of the position sensor, per motor", "deg"),
     "latency": ("delay from action to motor", "ms"),
     "observation_latency": ("delay from sensor to policy", "ms"),
     "push_force": ("push on the base, per axis", "N"),
@@ -150,12 +150,12 @@ def passive() -> str:
         [
             ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, limited by the shell"),
             ("stops, transversal", degrees(outer.lower, outer.upper), "deg", CONFIG),
-            ("stops, outer + inner", degrees(*robot.transversal_sum), "deg", CONFIG),
+            ("stops, sum of outer and inner angle", degrees(*robot.transversal_sum), "deg", CONFIG),
             ("stiffness of the stops", number(LIMIT_STIFFNESS), "N m/rad", "numerical"),
             ("damping of the stops", number(LIMIT_DAMPING), "N m s/rad", "numerical"),
             ("knee damping", number(robot.knee_damping), "N m s/rad", CONFIG),
             ("largest torque of the knee damping", number(robot.knee_damping_limit), "N m", CONFIG),
-            ("paw friction, `Simulation`", number(NOMINAL_FRICTION), "1", "chosen"),
+            ("paw friction, Python class `Simulation`", number(NOMINAL_FRICTION), "1", "chosen"),
             ("paw friction, nominal evaluation", number(MEAN_FRICTION), "1", "middle of the paper's range"),
         ],
     )

@@ -46,7 +46,10 @@ SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
               "velocity": "paper, robot, commands by a person"}  # fmt: skip
 """Words for `Evaluation.paper` by `Evaluation.kind`."""
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
-KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
+BOTH = [metric for metric in HEIGHT_METRICS if metric in PLACE_METRICS]
+KEYS = {"jumps": BOTH, "heights": [metric for metric in HEIGHT_METRICS if metric not in BOTH],
+        "places": [metric for metric in PLACE_METRICS if metric not in BOTH],
+        "walks": VELOCITY_METRICS, "turns": TURN_METRICS}  # fmt: skip
 POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
 RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else that in range
 ERRORS = {
@@ -56,6 +59,7 @@ ERRORS = {
     "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
 }
 """Key of the error, factor and format by kind."""
+COMMANDED = {"velocity": " (ahead, left, yaw)"}  # Names of the components of a command by kind
 MEASURED: dict[str, Json] = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))["tables"]
 ARMS = {"full": "full", "no_initialisation": "no initialisation", "no_estimates": "no estimates",
         "no_curriculum": "no curriculum"}  # fmt: skip
@@ -135,6 +139,13 @@ def trials_of(row: Row) -> str:
     return f"{max(value.trials or 0 for value in row.metrics.values()):,}"
 
 
+def trials_by_title(rows: Mapping[str, Row]) -> str:
+    """Format numbers of trials: the number of the first row, and other numbers after the last part of their title."""
+    usual = trials_of(next(iter(rows.values())))
+    others = {title.split(", ")[-1]: trials_of(row) for title, row in rows.items() if trials_of(row) != usual}
+    return usual + "".join(f"; {title}: {trials}" for title, trials in others.items())
+
+
 def goals_in_range(success: MetricValue) -> str:
     """Return the range of commands, such as "0.5 to 1.1 m", over which a success rate was taken."""
     return str(success.over).partition("goals of ")[2]
@@ -163,24 +174,26 @@ def main_table(policy: str, task: TaskCfg) -> str:
         on_robot = " / ".join(filter(None, (cell(line, metrics) for metrics in robot.values())))
         lines.append([*cells, on_robot] if robot else cells)
     nominal = rows["nominal"]
-    note = f"Each column is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}"
+    note = f"Trials: {trials_by_title({title: rows[name] for name, title in SHOWN.items() if name in rows})}. "
+    note += f"Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}"
     if kind_of(task) == "height":
-        note += ", in range: " + goals_in_range(nominal.metrics["in_range_success_rate"])
-    note += f".\n{together.capitalize()}: {' / '.join(robot)}" if robot else ""
+        note += "; *in range*: " + goals_in_range(nominal.metrics["in_range_success_rate"])
+    note += f".\nColumn *{together}*: {' / '.join(robot)}" if robot else ""
     return markdown(["", *titles, *([together] if robot else [])], lines) + f"\n{note}.\n"
 
 
 def all_conditions(policy: str, task: TaskCfg) -> str:
     """Return the table of a policy in all conditions, with 95 % intervals, and the reasons for missing conditions."""
     rows = first_seed(policy)
-    wide = PAGES["wide"][kind_of(task)]
+    wide = [column for column in PAGES["wide"][kind_of(task)] if cell(column, rows["nominal"].metrics)]
     results = [(title, rows[name].metrics) for name, (title, _) in CONDITIONS.items() if name in rows]
-    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in (*results, *published(task))]
+    lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
-    note = f"Each row is from {trials_of(nominal)} trials. Commands: {nominal.values['commands']}.\n"
-    note += f"Commands of the training: {trained_on(task, nominal.values)}.\n"
+    trials = trials_by_title({title: rows[name] for name, (title, _) in CONDITIONS.items() if name in rows})
+    note = f"Trials: {trials}. Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}.\n"
+    note += f"Commands in training: {trained_on(task, nominal.values)}.\n"
     reasons = [
-        f"Not measured: {title}, since {reason}.\n"
+        f"Not measured: *{title}*, because {reason}.\n"
         for name, (title, _) in CONDITIONS.items()
         if (reason := undefined(task, name))
     ]
@@ -203,17 +216,9 @@ def test_table(name: str) -> str:
 
 
 def key_table(name: str) -> str:
-    """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
-    lines = [
-        [
-            f"`{metric.key}`",
-            "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
-            metric.statistic.__name__,
-            metric.over,
-        ]
-        for metric in KEYS[name]
-    ]
-    return markdown(("key", "unit", "statistic", "over"), lines)
+    """Return a table of an evaluation's metrics: key, statistic and trials that count; name: of KEYS."""
+    lines = [[f"`{metric.key}`", metric.statistic.__name__, metric.over] for metric in KEYS[name]]
+    return markdown(("key", "statistic", "over"), lines)
 
 
 def measured_table(name: str) -> str:

@@ -21,16 +21,15 @@ RESULTS = Path(__file__).parents[2] / "docs/results"  # Pages with results
 RANDOMISED = {"randomize": True, "noise": True}
 CONDITIONS: dict[str, tuple[str, Json]] = {
     "nominal": ("nominal", {}),
-    "randomised": ("randomised robots, noise, latency, pushes", RANDOMISED),
-    "mujoco": ("nominal, SolverMuJoCo", {"solver": "mujoco"}),
-    "mujoco_randomised": ("randomised robots, noise, latency, pushes, SolverMuJoCo",
-                          RANDOMISED | {"solver": "mujoco"}),
+    "randomised": ("randomised", RANDOMISED),
+    "mujoco": ("SolverMuJoCo", {"solver": "mujoco"}),
+    "mujoco_randomised": ("randomised, SolverMuJoCo", RANDOMISED | {"solver": "mujoco"}),
     "friction_0.4": ("friction 0.4", {"friction": 0.4}),
     "payload_3_kg": ("payload of 3 kg", {"payload": 3.0}),
     "gains_0.6": ("kp and kd × 0.6", {"gain_scale": (0.6, 0.6)}),
     "sensor_offset_4_deg": ("position sensors off by up to 4°", {"sensor_offset": 4.0}),
     "latency_25_ms": ("latency 25 ms", {"latency": 25.0}),
-    "push_in_flight": ("randomised, pushed in flight too", RANDOMISED | {"push_in_flight": True}),
+    "push_in_flight": ("randomised, also pushed in flight", RANDOMISED | {"push_in_flight": True}),
 }  # fmt: skip
 """Title in tables and fields of `Conditions` by name, in the order of the tables; `payload` [kg] is a robot overlay."""
 PAGES: Json = tomllib.loads((Path(__file__).parents[1] / "policy_pages.toml").read_text(encoding="utf-8"))
@@ -55,9 +54,9 @@ def undefined(task: TaskCfg, name: str) -> str | None:
     if name == "friction_0.4" and task.evaluation.kind == "attitude":
         return "the robot floats and touches no ground"
     if name == "push_in_flight" and randomization.push_force is None and randomization.push_torque is None:
-        return "its randomisation has no pushes"
+        return "the task samples no pushes"
     if name == "push_in_flight" and randomization.push_in_flight:
-        return "its randomised robots always are"
+        return "the randomised robots are pushed in flight"
     return None
 
 

@@ -7,12 +7,12 @@ from jumper_warp.registry import TASKS, make_task
 # ---------------------------------------------------------------------- jumper
 
 
-@pytest.mark.parametrize("task", [[], ["vertical-jump"], ["velocity-rough"]], ids=" ".join)
-def test_help_of_train_fits_60_lines(capsys, monkeypatch, task):
+@pytest.mark.parametrize("command", ["train", "train vertical-jump", "train velocity-rough", "robot new"])
+def test_help_fits_60_lines(capsys, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "80")
-    code, out, _ = run(capsys, "train", *task, "--help")
+    code, out, _ = run(capsys, *command.split(), "--help")
     assert code == 0 and out.count("\n") <= 60
-    assert all(f" --{name}" in out for name in SHORT_HELP)
+    assert all(f" --{name}" in out for name in (SHORT_HELP if "train" in command else ["from"]))
 
 
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
