@@ -36,7 +36,7 @@ BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end of table -->)", re.
 TASKS = (
     "vertical-jump", "horizontal-jump", "horizontal-jump-sighted", "vertical-jump-standing", "horizontal-jump-standing",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
-    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+    "velocity-flat", "velocity-rough", "velocity-mars", "velocity-trot", "attitude",
 )  # fmt: skip
 PAPER, CAD, CONFIG = "paper", "CAD export", "authors' configuration"
 RANDOMISED = {
@@ -150,12 +150,12 @@ def passive() -> str:
         [
             ("stops, lateral", degrees(lateral.lower, lateral.upper), "deg", f"{CONFIG}, limited by the shell"),
             ("stops, transversal", degrees(outer.lower, outer.upper), "deg", CONFIG),
-            ("stops, outer + inner", degrees(*robot.transversal_sum), "deg", CONFIG),
+            ("stops, sum of outer and inner angle", degrees(*robot.transversal_sum), "deg", CONFIG),
             ("stiffness of the stops", number(LIMIT_STIFFNESS), "N m/rad", "numerical"),
             ("damping of the stops", number(LIMIT_DAMPING), "N m s/rad", "numerical"),
             ("knee damping", number(robot.knee_damping), "N m s/rad", CONFIG),
             ("largest torque of the knee damping", number(robot.knee_damping_limit), "N m", CONFIG),
-            ("paw friction, `Simulation`", number(NOMINAL_FRICTION), "1", "chosen"),
+            ("paw friction, Python class `Simulation`", number(NOMINAL_FRICTION), "1", "chosen"),
             ("paw friction, nominal evaluation", number(MEAN_FRICTION), "1", "middle of the paper's range"),
         ],
     )

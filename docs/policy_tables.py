@@ -46,7 +46,10 @@ SIMULATION = {"height": "paper, simulation", "place": "paper, simulation",
               "velocity": "paper, robot, commands by a person"}  # fmt: skip
 """Words for `Evaluation.paper` by `Evaluation.kind`."""
 ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
-KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
+BOTH = [metric for metric in HEIGHT_METRICS if metric in PLACE_METRICS]
+KEYS = {"jumps": BOTH, "heights": [metric for metric in HEIGHT_METRICS if metric not in BOTH],
+        "places": [metric for metric in PLACE_METRICS if metric not in BOTH],
+        "walks": VELOCITY_METRICS, "turns": TURN_METRICS}  # fmt: skip
 POLICY_PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
 RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else that in range
 ERRORS = {
@@ -56,6 +59,7 @@ ERRORS = {
     "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
 }
 """Key of the error, factor and format by kind."""
+COMMANDED = {"velocity": " (ahead, left, yaw)"}  # Names of the components of a command by kind
 MEASURED: dict[str, Json] = json.loads((RESULTS / "measurements.json").read_text(encoding="utf-8"))["tables"]
 ARMS = {"full": "full", "no_initialisation": "no initialisation", "no_estimates": "no estimates",
         "no_curriculum": "no curriculum"}  # fmt: skip
@@ -171,7 +175,7 @@ def main_table(policy: str, task: TaskCfg) -> str:
         lines.append([*cells, on_robot] if robot else cells)
     nominal = rows["nominal"]
     note = f"Trials: {trials_by_title({title: rows[name] for name, title in SHOWN.items() if name in rows})}. "
-    note += f"Commands: {nominal.values['commands']}"
+    note += f"Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}"
     if kind_of(task) == "height":
         note += "; *in range*: " + goals_in_range(nominal.metrics["in_range_success_rate"])
     note += f".\nColumn *{together}*: {' / '.join(robot)}" if robot else ""
@@ -186,7 +190,7 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     lines = [[words, *(cell(column, metrics) for column in wide)] for words, metrics in results]
     nominal = rows["nominal"]
     trials = trials_by_title({title: rows[name] for name, (title, _) in CONDITIONS.items() if name in rows})
-    note = f"Trials: {trials}. Commands: {nominal.values['commands']}.\n"
+    note = f"Trials: {trials}. Commands: {nominal.values['commands']}{COMMANDED.get(kind_of(task), '')}.\n"
     note += f"Commands in training: {trained_on(task, nominal.values)}.\n"
     reasons = [
         f"Not measured: *{title}*, because {reason}.\n"
@@ -212,17 +216,9 @@ def test_table(name: str) -> str:
 
 
 def key_table(name: str) -> str:
-    """Return a table of an evaluation's metrics: key, unit, statistic and trials that count; name: of KEYS."""
-    lines = [
-        [
-            f"`{metric.key}`",
-            "1" if metric.key.endswith("_rate") else unit_of(metric.key) or "1",
-            metric.statistic.__name__,
-            metric.over,
-        ]
-        for metric in KEYS[name]
-    ]
-    return markdown(("key", "unit", "statistic", "over"), lines)
+    """Return a table of an evaluation's metrics: key, statistic and trials that count; name: of KEYS."""
+    lines = [[f"`{metric.key}`", metric.statistic.__name__, metric.over] for metric in KEYS[name]]
+    return markdown(("key", "statistic", "over"), lines)
 
 
 def measured_table(name: str) -> str:

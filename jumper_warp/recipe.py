@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from jumper_warp.registry import find_task
 from jumper_warp.rl.cfg import SESSION, TrainCfg
@@ -22,9 +22,6 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json, task_t
 from jumper_warp.utils.checks import check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
-
-if TYPE_CHECKING:
-    from jumper_warp.envs.env import Env
 
 SOLVERS = {"SolverJumper": "jumper", "SolverMuJoCo": "mujoco"}  # Setting `solver` by class name of the solver
 
@@ -97,25 +94,6 @@ class Recipe:
         task = self.task
         if task_from_json(json.loads(json.dumps(task_to_json(task))), _imported()) != task:
             raise TaskError(f"{task.name} differs from the original after it is saved as JSON and loaded")
-
-    def make_env(self, num_envs: int, seed: int, device: Any) -> Env:
-        """Return a training's environment. device: of PyTorch. Raises InputError as `Env`."""
-        from jumper_warp.envs.env import Env
-
-        settings: Any = {name: getattr(self, name) for name in ("solver", "randomize", "noise", "robot")}
-        return Env(self.task, num_envs, seed=seed, device=str(device), **settings)
-
-    def tested_task(self, randomize: bool, rewards: bool = False) -> TaskCfg:
-        """Return the task of a test: without critic, with rewards and events only if asked for and if randomised.
-
-        Raises TaskError: events are needed, and their functions were not found.
-        """
-        if randomize and self.missing:
-            raise TaskError(self.missing)
-        observations = dataclasses.replace(self.task.observations, critic=())
-        events = self.task.events if randomize else ()
-        kept = self.task.rewards if rewards else ()
-        return dataclasses.replace(self.task, rewards=kept, observations=observations, events=events)
 
 
 def _imported() -> list[ModuleType]:

@@ -171,6 +171,8 @@ TASKS: dict[str, TaskEntry] = {
     ),
     "velocity-rough": TaskEntry(f"{WALK}.rough:velocity_rough", replace(WALKING, final_entropy_coef=0.0003), (), SCORE,
                                 "walk on level and rough ground", max_iterations=7500),
+    "velocity-mars": TaskEntry(f"{WALK}.rough:velocity_mars", replace(WALKING, final_entropy_coef=0.0003), (), SCORE,
+                               "walk on Mars", max_iterations=7500),
     "velocity-trot": TaskEntry(f"{WALK}.flat:velocity_trot", WALKING, (), SCORE, "trot on level ground"),
     "vertical-jump-paper": TaskEntry(f"{PRINTED}vertical_jump_paper", PAPER_HEIGHTS, num_envs=4096, max_iterations=4000,
                                      about="jump to a height, as in the paper"),

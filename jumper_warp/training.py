@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
+import torch
+
+from jumper_warp.envs.env import Env
 from jumper_warp.policies.policy import actor_init_from_policy
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
@@ -42,4 +46,12 @@ def train(
     actor_init = None
     if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
-    return runner.train(cfg, recipe.make_env, command, actor_init, checkpoints, observers)
+    return runner.train(cfg, partial(make_env, recipe), command, actor_init, checkpoints, observers)
+
+
+def make_env(recipe: Recipe, num_envs: int, seed: int, device: str | torch.device) -> Env:
+    """Return the environment in which a recipe's policy is trained. Raises InputError as `Env`."""
+    return Env(
+        recipe.task, num_envs, seed=seed, device=device, solver=recipe.solver, randomize=recipe.randomize,
+        noise=recipe.noise, robot=recipe.robot,
+    )  # fmt: skip

@@ -32,8 +32,8 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "diff.rollout", "diff.torch_rollout", "envs.gradients", "envs.gradient_check",
     )),
     "training": ("Training", (
-        "rl.cfg", "rl.runner", "rl.learner", "rl.torch.ppo", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
-        "rl.mirror", "rl.distributed",
+        "rl.cfg", "rl.runner", "rl.learner", "rl.torch.ppo", "rl.networks", "rl.checkpoint", "rl.run_folder",
+        "rl.logger", "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (
         "policies.policy", "policies.spec", "policies.catalog", "policies.onnx", "deploy.policy",

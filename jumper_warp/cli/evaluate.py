@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from jumper_warp.cli.flags import list_flags, option_of, wants_help
 from jumper_warp.cli.flags import parse as parse_flags
-from jumper_warp.cli.flags import wants_help
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.utils.errors import suggestion
 from jumper_warp.utils.files import read_json
@@ -59,17 +58,17 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def check_suite_flags(task: TaskCfg, args: Sequence[str]) -> None:
     """Raise UsageError if args, without --suite, have a flag that only test suites of the task's policies have."""
-    from jumper_warp.evaluation.conditions import Conditions
     from jumper_warp.evaluation.run import EvaluateCfg
     from jumper_warp.evaluation.suites import suites_for
-    from jumper_warp.utils.summary import PrintFlags
 
-    kinds = (EvaluateCfg, type(task.evaluation.default_flags("evaluate")), Conditions, PrintFlags)
-    known = {field.name for kind in kinds for field in fields(kind)}
-    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
-        name = flag[2:].replace("-", "_")
-        of = [suite for suite, kind in suites_for(task).items() if name in {field.name for field in fields(kind)}]
-        if of and name not in known:
+    def flags_of(settings: Any) -> set[str]:
+        """Return the flags of a settings dataclass, with leading dashes."""
+        return {f"--{flag.name}" for flag in list_flags(settings, described=False)}
+
+    known = flags_of(EvaluateCfg(task.evaluation.default_flags("evaluate")))
+    for flag in map(option_of, args):
+        of = [suite for suite, kind in suites_for(task).items() if flag in flags_of(kind)]
+        if of and flag not in known:
             raise UsageError(f"{flag} needs a test suite: add {SUITE} {' or '.join(of)}")
 
 
@@ -93,17 +92,14 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
     """Return the policy, the first command-line argument; print the general help and exit with 0 if it is --help.
 
-    A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is
-    missing or another flag.
+    about: text for the help. Raises UsageError: the first argument is missing or another flag.
     """
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
     if not args or args[0].startswith("-"):
         raise UsageError(f"the policy comes first: jumper {command} POLICY [flags]")
-    from jumper_warp.policies.catalog import newest_run
-
-    return str(newest_run(args[0]))
+    return args[0]
 
 
 def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = ()) -> EvaluationRun:
@@ -115,10 +111,10 @@ def open_run(policy: str, modules: Sequence[ModuleType], args: Sequence[str] = (
     from jumper_warp.utils.progress import phase
 
     if wants_help(args):
-        from jumper_warp.policies.catalog import CONFIG, find_policy
+        from jumper_warp.policies.catalog import CONFIG, find_policy, newest_run, run_folder
         from jumper_warp.recipe import Recipe
 
-        folder = Path(policy).parents[1] if Path(policy).suffix == ".pt" else find_policy(policy)
+        folder = run_folder(Path(policy)) if Path(policy).suffix == ".pt" else find_policy(newest_run(policy))
         return cast("Any", Recipe.from_json(read_json(folder / CONFIG, "configuration"), modules, complete=False))
     with phase(f"opening {policy}"):
         from jumper_warp.evaluation.run import EvaluationRun

@@ -55,7 +55,7 @@ def export(cfg: ExportCfg) -> Path:
     cannot be used, the folder has a file's suffix, or exists without `overwrite`.
     CheckpointError: the checkpoint cannot be used.
     """
-    from jumper_warp.policies.catalog import is_run, newest_run, run_folder
+    from jumper_warp.policies.catalog import run_folder
     from jumper_warp.policies.policy import Policy, checked_folder, export_onnx, learning_curve, save_policy
     from jumper_warp.rl.run_names import CHECKPOINTS
 
@@ -67,11 +67,11 @@ def export(cfg: ExportCfg) -> Path:
         return export_for_robot(cfg)
     if len(cfg.sources) != 1:
         raise InputError("give one policy, or several with --page or --bundle")
-    source = Path(newest_run(cfg.sources[0]))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out, cfg.overwrite)
-    trained = is_run(source)
-    policy = Policy.load(source, newest=cfg.newest)
+    policy = Policy.load(cfg.sources[0], newest=cfg.newest)
+    source = Path(policy.source)
+    trained = policy.checkpoint is not None
     if trained:
         chosen = ("newest " if cfg.newest else "best ") if (source / CHECKPOINTS).is_dir() else ""
         print(f"{run_folder(source)}: {chosen}checkpoint, iteration {policy.config['iteration']}", file=sys.stderr)
@@ -112,10 +112,9 @@ def export_page(cfg: ExportCfg, folder: Path) -> Path:
     Raises InputError or PolicyError: see `write_page`.
     """
     from jumper_warp.live.site import write_page
-    from jumper_warp.policies.catalog import newest_run
     from jumper_warp.policies.policy import Policy
 
-    path = write_page(folder, [Policy.load(newest_run(source), newest=cfg.newest) for source in cfg.sources])
+    path = write_page(folder, [Policy.load(source, newest=cfg.newest) for source in cfg.sources])
     print(path)
     return path
 

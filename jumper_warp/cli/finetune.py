@@ -23,10 +23,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     modules: loaded by --task-module, for tasks outside the project.
     Raises UsageError, InputError or OSError: the policy or a flag is invalid.
     """
-    name = policy_of("finetune", ABOUT, args)
+    policy = policy_of("finetune", ABOUT, args)
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
-    from jumper_warp.policies.catalog import find_policy
+    from jumper_warp.policies.catalog import find_policy, newest_run
 
+    name = str(newest_run(policy))
     if Path(name).suffix != ".pt":
         find_policy(name)  # a misspelt name is reported before PyTorch is imported
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])

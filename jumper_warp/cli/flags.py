@@ -206,7 +206,7 @@ def help_field(flag: Flag) -> tuple[str, Any, Any]:
     hint = "" if flag.default in (None, dataclasses.MISSING) or "(default" in flag.about else None
     metavar = flag.name if flag.positional else None
     settings = tyro.conf.arg(name=flag.name, metavar=metavar, help=flag.about, help_behavior_hint=hint)
-    name = re.sub(r"\W", "_", flag.name)
+    name = "flag_" + re.sub(r"\W", "_", flag.name)  # `from` is a keyword of Python
     required = flag.default is dataclasses.MISSING
     field = dataclasses.field() if required else dataclasses.field(default_factory=lambda: flag.default)
     return name, Annotated[(flag.kind, settings, *flag.marks)], field

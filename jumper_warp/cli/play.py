@@ -85,7 +85,6 @@ def play_together(args: Sequence[str], modules: Sequence[ModuleType]) -> None:
     from jumper_warp.compare.motions import compare_motions
     from jumper_warp.compare.tasks import task_of
     from jumper_warp.evaluation.commands import PlayCfg, RecordingCfg, open_viewer, record
-    from jumper_warp.policies.catalog import newest_run
     from jumper_warp.utils.output import output_dir
     from jumper_warp.viz.pairs import write_pictures
     from jumper_warp.viz.recording import load_npz
@@ -103,7 +102,7 @@ def play_together(args: Sequence[str], modules: Sequence[ModuleType]) -> None:
             recording = load_npz(Path(path))
             tasks.append(task_of(str(recording.notes.get("task", ""))))
         else:
-            run = open_run(str(newest_run(path)), modules, flags)
+            run = open_run(path, modules, flags)
             cfg = parse("play", run.task, [path, *flags], PlayCfg)
             folder = folder or output_dir("play", cfg.out)
             _, recording = record(run, replace(cfg, out=folder))

@@ -2,7 +2,7 @@
 
     --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
-They are derived from the task. The flag of a term's number is its dotted name (`jumper_warp.tasks.params`), without the
+They are derived from the task. The flag of a term's number is its dotted name (`jumper_warp.tasks.terms`), without the
 term's name in a section with one term, as `--env.curriculum.tolerance`; other settings have the name of their field.
 """
 
@@ -60,7 +60,7 @@ def flags_of(task: TaskCfg) -> Any:
 
     Raises InputError: two flags have one name.
     """
-    flags = _flag_of_dataclass(task, task.name)
+    flags = _flag(task, TaskCfg, task.name)
     return flags and flags.value
 
 
@@ -70,35 +70,26 @@ def flag_name(name: str) -> str:
 
 
 def _flag(value: Any, hint: Any, where: str) -> Setting | None:
-    """Return the flag or group of flags for a part of a task, None if it has none; where: its path, for messages."""
+    """Return the flag or group of flags for a part of a task, None if it has none; where: its path, for messages.
+
+    Fields of a dataclass that hold functions or names have none. Its docstring and those of its fields become the help.
+    """
     if isinstance(value, Term):
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
         return _flag(value.settings, Any, where)
     if isinstance(value, Command | Evaluation):
         return None
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _flag_of_dataclass(value, where)
-    if parts := _parts(value):
-        flags = {name: _flag(part, Any, f"{where} {name}") for name, part in parts.items()}
-        present = {name: flag for name, flag in flags.items() if flag is not None}
-        return _group(None, present, where) if present else None
-    return Setting(hint, value) if _is_number(value, hint) else None
-
-
-def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
-    """Return the flags of a dataclass's fields; fields that hold functions or names have none.
-
-    Its docstring and those of its fields become the help. where: path of the dataclass, for messages.
-    """
-    hints = get_type_hints(type(value))
-    docs = field_docs(type(value))
+    if not (parts := _parts(value)):
+        return Setting(hint, value) if _is_number(value, hint) else None
+    kind = None if isinstance(value, tuple) else type(value)
+    hints = get_type_hints(kind) if kind else {}
+    docs = field_docs(kind) if kind else {}
     flags = {}
-    for name, part in _parts(value).items():
-        flag = _flag(part, hints[name], f"{where} {name}")
-        if flag is not None:
+    for name, part in parts.items():
+        if (flag := _flag(part, hints.get(name, Any), f"{where} {name}")) is not None:
             flags[name] = flag._replace(about=docs.get(name, flag.about))
-    return _group(_first_paragraph(type(value).__doc__), flags, where) if flags else None
+    return _group(_first_paragraph(kind and kind.__doc__), flags, where) if flags else None
 
 
 def _flag_of_term(term: Term, where: str) -> Setting | None:

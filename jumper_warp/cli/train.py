@@ -6,10 +6,10 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -24,11 +24,10 @@ from jumper_warp.utils.threads import checked_threads
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from jumper_warp.live.training import TrainingWatch
     from jumper_warp.recipe import Recipe
     from jumper_warp.rl.checkpoint import Checkpoint
     from jumper_warp.rl.run_folder import TrainResult
-    from jumper_warp.robot.overlay import RobotOverlay
+    from jumper_warp.rl.runner import Observer
 
 
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
@@ -68,8 +67,8 @@ class TrainArgs:
     video_every: int = 0  # Iterations between two films in the run's folder; 0: none
 
 
-def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
-    """Return the recipe that the arguments of `jumper train` make, and the checkpoints that are resumed.
+def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint], TrainArgs]:
+    """Return the recipe that the arguments of `jumper train` make, the checkpoints that are resumed, and all flags.
 
     Exits with 0 after help. args: the task, then flags. With --resume the saved recipe of the run has the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there
@@ -86,10 +85,12 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     preset = preset_flags(name, entry, args)
     from jumper_warp.cli.task_flags import parse_with_task
     from jumper_warp.recipe import Recipe
+    from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    robot = overlay_in(args)
+    files = values_of("--robot", args)
+    robot = load_overlay(Path(files[0])) if files else None
     recipe, checkpoints = resumed(Recipe(entry.task(name, robot), entry.training(name), robot=robot), args)
     default = TrainArgs(recipe.train, recipe.solver, recipe.randomize, recipe.noise)
     parsed, task = parse_with_task(default, recipe.task, f"train {name}", [*preset, *args], SHORT_HELP)
@@ -98,8 +99,8 @@ def parse_train(args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
     robot = robot or recipe.robot
     if robot is not None:
         task, robot = with_flagged_ranges(recipe.task, task, robot, flagged_ranges([*preset, *args]))
-    given = {name: getattr(parsed, name) for name in ("solver", "randomize", "noise")}
-    return Recipe(with_history(task, parsed.history), parsed.cfg, robot=robot, **given), checkpoints
+    task = with_history(task, parsed.history)
+    return Recipe(task, parsed.cfg, parsed.solver, parsed.randomize, parsed.noise, robot), checkpoints, parsed
 
 
 def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoint]]:
@@ -114,7 +115,6 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
     if "resume" not in session:
         return recipe, []
     from jumper_warp.rl.checkpoint import CheckpointError, find_checkpoints
-    from jumper_warp.rl.run_names import seed_folders
 
     checkpoints = find_checkpoints(dataclasses.replace(recipe.train, **session))
     if not checkpoints:
@@ -126,9 +126,8 @@ def resumed(recipe: Recipe, args: Sequence[str]) -> tuple[Recipe, list[Checkpoin
         raise CheckpointError(f"{checkpoint.path}: {error}") from error
     if saved.train.task != recipe.train.task:
         raise CheckpointError(f"{checkpoint.path}: of a run of {saved.train.task:.60}, not of {recipe.train.task}")
-    seeds = tuple(seed_folders(checkpoint.path.parents[2])) if len(checkpoint.path.parents) > 2 else ()
-    train = dataclasses.replace(saved.train, seeds=seeds)
-    return dataclasses.replace(saved, train=train), checkpoints
+    seeds = tuple(each.seed for each in checkpoints if each.seed is not None)
+    return dataclasses.replace(saved, train=dataclasses.replace(saved.train, seeds=seeds)), checkpoints
 
 
 def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
@@ -154,19 +153,6 @@ def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
         flags += [] if switch_of(option) in given else [word]
     print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
     return flags
-
-
-def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
-    """Return the robot overlay of the flag --robot in unparsed arguments, None without it.
-
-    Raises InputError or OSError: the overlay is invalid.
-    """
-    path = values_of("--robot", args)
-    if not path:
-        return None
-    from jumper_warp.robot.overlay import load_overlay
-
-    return load_overlay(Path(path[0]))
 
 
 def flagged_ranges(args: Sequence[str]) -> set[str]:
@@ -198,26 +184,10 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     return shlex.join(["jumper", "train", *kept])
 
 
-def watches(args: Sequence[str]) -> list[TrainingWatch]:
-    """Return the observers that the flags --watch and --video-every in unparsed arguments ask for.
-
-    `parse_train` returns a recipe, and a recipe holds nothing about terminals and viewers.
-    """
-    switches = [arg for arg in args if arg in ("--watch", "--no-watch")]
-    watched = switches[-1:] == ["--watch"]
-    every = int((values_of("--video-every", args) or ["0"])[-1])
-    if not watched and every == 0:
-        return []
-    from jumper_warp.live.training import TrainingWatch
-
-    viewer: Any = (values_of("--viewer", args) or ["rerun"])[-1]
-    return [TrainingWatch(viewer if watched else "none", every)]
-
-
-def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[str]) -> None:
+def report_cpu_time(cfg: TrainCfg, done: int, preset: bool) -> None:
     """Print the expected duration of a training on a CPU, unless it is short.
 
-    done: iterations before a resume; preset: whether a preset is used; presets: names of the task's presets.
+    done: iterations before a resume; preset: whether a preset is used.
     """
     from jumper_warp.rl.logger import format_duration
 
@@ -231,7 +201,7 @@ def report_cpu_time(cfg: TrainCfg, done: int, preset: bool, presets: Iterable[st
         reason = ""
     if seconds < SHORT_TRAINING:
         return
-    names = " or ".join(f"--preset {name}" for name in presets)
+    names = "" if preset or done else " or ".join(f"--preset {name}" for name in TASKS[cfg.task].presets)
     advice = f"; settings for such a machine: {names}" if names else ""
     duration = f"{seconds / 3600.0:.0f} h" if seconds > 5400.0 else format_duration(seconds)
     print(f"without a GPU this training takes about {duration}{reason}{advice}", file=sys.stderr)
@@ -243,22 +213,24 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     modules: the user's, whose tasks are registered already.
     Raises as `parse_train` and `jumper_warp.training.train`.
     """
-    recipe, checkpoints = parse_train(args)
+    recipe, checkpoints, parsed = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
     from jumper_warp.training import train
     from jumper_warp.utils.runtime import configure_device
 
     cfg = recipe.train
     task = recipe.task
-    preset = bool(values_of("--preset", args))
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
-        presets = () if preset or checkpoints else find_task(task.name)[1].presets
-        report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, preset, presets)
+        report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, bool(parsed.preset))
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     command = command_line(args, modules)
-    observers = watches(args) if is_rank_0 else []
+    observers: list[Observer] = []
+    if is_rank_0 and (parsed.watch or parsed.video_every):
+        from jumper_warp.live.training import TrainingWatch
+
+        observers = [TrainingWatch(parsed.viewer if parsed.watch else "none", parsed.video_every)]
     try:
         result = train(recipe, checkpoints=checkpoints, command=command, observers=observers)
     except (MemoryError, RuntimeError) as error:

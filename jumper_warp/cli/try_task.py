@@ -56,8 +56,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     cpu = configure_device(cfg.device).driver is None
     folder = output_dir("try", cfg.out)
     flags = [*short_flags(entry.presets.get("laptop", DEFAULT), cfg, cpu), "--log-root", str(folder)]
-    recipe, _ = parse_train([base, *flags, "--run-name", "base"])
-    changed, _ = parse_train([task.name, *flags, "--run-name", "change"])
+    recipe = parse_train([base, *flags, "--run-name", "base"])[0]
+    changed = parse_train([task.name, *flags, "--run-name", "change"])[0]
     if TASKS[task.name].ppo == PpoCfg():  # the file names no settings of PPO: those of the base apply
         train = dataclasses.replace(changed.train, ppo=recipe.train.ppo, best_metric=recipe.train.best_metric)
         changed = dataclasses.replace(changed, train=train)

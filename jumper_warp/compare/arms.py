@@ -16,8 +16,7 @@ import numpy as np
 
 from jumper_warp.policies.catalog import CONFIG, find_policy
 from jumper_warp.rl.metrics_file import METRICS_FILE, logged_line
-from jumper_warp.rl.resume import flat_settings
-from jumper_warp.rl.run_folder import SOURCES
+from jumper_warp.rl.run_folder import SOURCES, flat_settings
 from jumper_warp.rl.run_names import SEED, seed_folders, split_seed, start_time, title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_file, read_json

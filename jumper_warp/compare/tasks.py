@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jumper_warp.compare.arms import differences
 from jumper_warp.registry import TASKS, load_task_module, make_task
-from jumper_warp.rl.resume import flat_settings
+from jumper_warp.rl.run_folder import flat_settings
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError

@@ -9,7 +9,7 @@ from pathlib import Path
 from jumper_warp.compare.arms import OF_A_SEED, Member, differences
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import last_metrics
-from jumper_warp.rl.resume import flat_settings
+from jumper_warp.rl.run_folder import flat_settings
 from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, MANIFEST, newest, seed_folders, title
 from jumper_warp.rl.runner import Observer
 from jumper_warp.training import train

@@ -505,7 +505,5 @@ class Env(Stages):
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)
         self._started = bool((self.episodes.step_count.numpy() > arrays.FIRST_STEP_COUNT).all())
-        for skill in self.skills:
-            skill.params.restore()
         self.sim.dynamics.parameters_changed()
         self._restart_gradients()

@@ -22,7 +22,7 @@ from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.copying import Struct
-from jumper_warp.tasks.params import ParamArrays
+from jumper_warp.tasks.terms import TaskParams
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.kernels import Kernel, KernelStruct, content_hash, records
 from jumper_warp.utils.threads import locked
@@ -258,6 +258,44 @@ class TaskRuntime:
                 states[metric.field] = states[metric.per] = 0.0
         self.states.assign(wp.array(states, dtype=self.task.state, device=self.device))
         return values_by_name
+
+
+class ParamArrays:
+    """Device array of the parameters of all terms of a task; values can change while captured CUDA graphs read them."""
+
+    def __init__(self, params: TaskParams, device: wp.DeviceLike) -> None:
+        """Copy a task's initial parameters to the device; params: names and values; device: Warp device."""
+        self.params = params
+        self._numbers = list(params.values)  # `values` before their conversion to float32
+        self.values = wp.array(params.values, dtype=float, device=device)
+        self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
+        """Numbers changed by `set`, (len(values),); infinity elsewhere."""
+
+    @locked
+    def set(self, name: str, value: float) -> None:
+        """Change a term's parameter, given by its dotted name, on the device: in `values`, which the kernels read.
+
+        `changed` holds the same numbers, and is saved with the environment's state.
+        Raises InputError: there is none, or the term refuses the value in a configuration too.
+        """
+        i = self.params.index(name)
+        value = self._numbers[i] = self.params.checked([*self._numbers[:i], value, *self._numbers[i + 1 :]], i)
+        for array in (self.values, self.changed):
+            array[i : i + 1].fill_(value)
+
+    def restore(self) -> None:
+        """Reset all parameters to `params.values` except those that `set` changed. Waits for the device."""
+        self._numbers = self.restored(self.changed.numpy())
+        self.values.assign(np.array(self._numbers, dtype=np.float32))
+
+    def restored(self, changed: np.ndarray) -> list[float]:
+        """Return all parameters, with those of `changed` that are finite. Raises InputError: a term refuses one."""
+        decimals = [float(str(value)) for value in changed]  # such as 0.1 for the float32 0.100000001
+        pairs = zip(self.params.values, decimals, strict=True)
+        numbers = [value if math.isinf(change) else change for value, change in pairs]
+        for slot in (slot for slots in self.params.slots.values() for slot in slots):
+            slot.term.with_flat_numbers(numbers[slot.first : slot.stop])
+        return numbers
 
 
 def _finite(states: np.ndarray, field: str) -> np.ndarray:

@@ -44,7 +44,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Restore the arrays of a saved state of an environment; `Env.load_state_dict` updates what follows from them.
+    """Restore the arrays of a saved state of an environment, and the terms' numbers that `Env.set` had changed.
 
     Values that are not finite are restored too: without `auto_reset` a diverged world keeps them.
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed, randomize,
@@ -53,41 +53,36 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     check_type("state", state, dict)
     for name, value in state.items():
         check_type(f"saved {name!s:.60}", value, torch.Tensor)
-    tensors = _tensors(env)
-    saved = {prefix: records(array).copy() for prefix, array in _records(env).items()}
-    conditions = _conditions(env)
-    fields = {prefix + name: (prefix, name) for prefix, values in saved.items() for name in values.dtype.names or ()}
-    names = {*tensors, *fields, *conditions, FINGERPRINT, SEED}
-    if names != state.keys():
+    own = save_state(env)
+    if own.keys() != state.keys():
         raise InputError(
-            f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
-            f"has unknown {sorted(state.keys() - names)[:5]}"
+            f"saved by another version, task or solver: lacks {sorted(own.keys() - state.keys())[:5]}, "
+            f"has unknown {sorted(state.keys() - own.keys())[:5]}"
         )
     if (saved_envs := len(state["env.done"])) != env.num_envs:
         raise InputError(f"saved with num_envs {saved_envs}, this environment has {env.num_envs}")
-    for name, own in conditions.items():
-        if not torch.equal(state[name], own):
+    for name, value in _conditions(env).items():
+        if not torch.equal(state[name], value):
             option = name.partition(".")[2]
-            raise InputError(f"saved with {option} {state[name].item()}, this environment has {option} {own.item()}")
-    expected = tensors | {
-        field: torch.from_numpy(saved[prefix][name].copy()) for field, (prefix, name) in fields.items()
-    }
-    for name, tensor in expected.items():
-        if (state[name].shape, state[name].dtype) != (tensor.shape, tensor.dtype):
+            raise InputError(f"saved with {option} {state[name].item()}, this environment has {option} {value.item()}")
+    for name, value in own.items():
+        if (state[name].shape, state[name].dtype) != (value.shape, value.dtype):
             raise InputError(f"saved {name} has another shape or type")
     for skill in env.skills:
         skill.params.restored(state[f"{skill.task.name}/changed"].numpy())
-    if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
+    if not torch.equal(state[FINGERPRINT], own[FINGERPRINT]):
         raise InputError("saved with other robots: the description or the task's motors differ")
-    seed = purpose_seed(env.stream, env.seed)
-    if int(state[SEED]) != seed:
-        raise InputError(f"saved with seed {int(state[SEED])}, this environment has seed {seed}")
-    for field, (prefix, name) in fields.items():
-        saved[prefix][name] = state[field].numpy()
+    if not torch.equal(state[SEED], own[SEED]):
+        raise InputError(f"saved with seed {int(state[SEED])}, this environment has seed {int(own[SEED])}")
     for prefix, array in _records(env).items():
-        array.assign(wp.array(saved[prefix], dtype=array.dtype, device=env.wp_device))
-    for name, tensor in tensors.items():
+        fields = records(array).copy()
+        for name in fields.dtype.names or ():
+            fields[name] = state[prefix + name].numpy()
+        array.assign(wp.array(fields, dtype=array.dtype, device=env.wp_device))
+    for name, tensor in _tensors(env).items():
         tensor.copy_(state[name])
+    for skill in env.skills:
+        skill.params.restore()
 
 
 def _conditions(env: Stages) -> dict[str, torch.Tensor]:

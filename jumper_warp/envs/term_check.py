@@ -8,7 +8,7 @@ from multiprocessing import get_context
 from signal import Signals
 from typing import Any
 
-from jumper_warp.kernels.mdp.options import FAST
+from jumper_warp.kernels.mdp.factory import FAST
 from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
 from jumper_warp.tasks.functions import is_own
 

@@ -15,6 +15,7 @@ from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
+from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_flags, check_seed, check_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json
@@ -143,6 +144,18 @@ def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditio
     return robots[first]
 
 
+def evaluated_task(recipe: Recipe, randomize: bool, rewards: bool = False) -> TaskCfg:
+    """Return a recipe's task for a test: without critic, with rewards only if asked for, with events if randomised.
+
+    Raises TaskError: events are needed, and their functions were not found.
+    """
+    if randomize and recipe.missing:
+        raise TaskError(recipe.missing)
+    task = recipe.task if rewards else replace(recipe.task, rewards=())
+    events = task.events if randomize else ()
+    return replace(task, observations=replace(task.observations, critic=()), events=events)
+
+
 def env_of_recipe(
     recipe: Recipe,
     num_envs: int,
@@ -161,7 +174,7 @@ def env_of_recipe(
     """
     from jumper_warp.envs.env import Env
 
-    task = recipe.tested_task(conditions.randomize, rewards)
+    task = evaluated_task(recipe, conditions.randomize, rewards)
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
         return Env(task, num_envs, **conditions.env_settings(recipe.robot) | scene)

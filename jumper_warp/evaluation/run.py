@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.conditions import Conditions, env_of_recipe, shared_robot
+from jumper_warp.evaluation.conditions import Conditions, env_of_recipe, evaluated_task, shared_robot
 from jumper_warp.evaluation.log import EvaluationLog, check, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.skills import WALK, SkillNames
@@ -251,10 +251,10 @@ class EvaluationRun(Run):
         Raises PolicyError, TaskError or CheckpointError.
         """
         super().__init__()
-        self.source = source
         from jumper_warp.policies.policy import Policy
 
         self.policy = Policy.load(source)
+        self.source = self.policy.source
         self.recipe = self.policy.recipe(modules)
         self.task = self.recipe.task
         self.trained_robot = self.recipe.robot
@@ -362,7 +362,7 @@ class SkillRun(Run):
         self.names = astuple(names or SkillNames())
         self.policies = [Policy.load(name) for name in self.names]
         self.recipes = [policy.recipe() for policy in self.policies]
-        self.tasks = [recipe.tested_task(randomize=False) for recipe in self.recipes]
+        self.tasks = [evaluated_task(recipe, randomize=False) for recipe in self.recipes]
         self.skills = self.tasks
         for task, kind in zip(self.tasks, (VelocityEvaluation, HeightEvaluation, PlaceEvaluation), strict=True):
             if not isinstance(task.evaluation, kind):

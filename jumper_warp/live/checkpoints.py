@@ -18,6 +18,7 @@ from jumper_warp.recipe import Recipe
 from jumper_warp.rl.checkpoint import latest_checkpoint, newest_name
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_names import CHECKPOINTS
+from jumper_warp.training import make_env
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import parse_json
 
@@ -36,7 +37,7 @@ def watch_checkpoints(
     """
     path, state, _, _ = latest_checkpoint(run / CHECKPOINTS)
     recipe = Recipe.from_json(parse_json(state["config"], "config"), list(modules) or None)
-    env = recipe.make_env(WORLDS, recipe.train.seed, device)
+    env = make_env(recipe, WORLDS, recipe.train.seed, device)
     env.reset()
     levels = state["env"]["env.level"].numpy()
     env.episodes.level.assign(np.sort(levels)[np.linspace(0, len(levels) - 1, WORLDS).astype(int)])

@@ -74,6 +74,22 @@ def find_policy(name: str | Path) -> Path:
     return path
 
 
+def open_source(source: str | Path) -> tuple[str | Path, Json, bytes]:
+    """Return the name or folder of a policy, and its verified configuration and ONNX file; both empty for a run.
+
+    source: a task's log folder becomes its newest run, see `newest_run`. Raises PolicyError as `find_policy` and
+    `read_files`, and CheckpointError as `newest_run`.
+    """
+    source = newest_run(source)
+    if is_run(source):
+        return source, {}, b""
+    folder = find_policy(source)
+    files = read_files(folder)
+    config = parse_object(folder / CONFIG, files[CONFIG])
+    check_version(folder / CONFIG, config)
+    return source, config, files[ONNX]
+
+
 def _own_policy(name: Path) -> Path | None:
     """Return the folder of the project's policy of this name (- counts as _), None: there is none."""
     folder = POLICIES / str(name).replace("-", "_")

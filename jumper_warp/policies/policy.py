@@ -88,6 +88,7 @@ class Policy(nn.Module):
         """
         super().__init__()
         self.interface = interface
+        self.source: str | Path = ""  # Name, folder, run or checkpoint from which the policy was loaded
         self.checkpoint: Path | None = None  # File of a training run from which the policy was loaded
         self.config = dict(config or {})
         tensors = {name: tensor.detach().float().cpu().clone() for name, tensor in _named(layers, mean, std).items()}
@@ -114,20 +115,10 @@ class Policy(nn.Module):
         rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
         Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
         """
-        source = catalog.newest_run(source)
-        if catalog.is_run(source):
-            return _policy_of_run(Path(source), newest)
-        folder = catalog.find_policy(source)
-        files = catalog.read_files(folder)
-        config = catalog.parse_object(folder / catalog.CONFIG, files[catalog.CONFIG])
-        catalog.check_version(folder / catalog.CONFIG, config)
-        try:
-            spec = PolicyInterface.from_json(config.get("interface"))
-            tensors = tensors_from_onnx(files[catalog.ONNX], spec, config)
-        except PolicyError as error:
-            raise PolicyError(f"{folder}: {error}") from error
-        layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(spec.sizes) - 1)]
-        return cls(layers, tensors["normaliser.mean"], tensors["normaliser.std"], spec, config)
+        source, config, weights = catalog.open_source(source)
+        policy = _policy_of_folder(source, config, weights) if config else _policy_of_run(Path(source), newest)
+        policy.source = source
+        return policy
 
     def recipe(self, modules: Iterable[ModuleType] = ()) -> Recipe:
         """Return the recipe of the policy's training, from its configuration; see `Recipe.from_json`.
@@ -187,6 +178,20 @@ def _named(layers: Weights, mean: torch.Tensor, std: torch.Tensor) -> dict[str, 
     for i, (weight, bias) in enumerate(layers):
         tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
     return tensors
+
+
+def _policy_of_folder(source: str | Path, config: Json, weights: bytes) -> Policy:
+    """Return the policy of a folder's configuration and ONNX file. Raises PolicyError: they do not fit each other.
+
+    source: name or folder, for messages.
+    """
+    try:
+        spec = PolicyInterface.from_json(config.get("interface"))
+        tensors = tensors_from_onnx(weights, spec, config)
+    except PolicyError as error:
+        raise PolicyError(f"{source}: {error}") from error
+    layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(spec.sizes) - 1)]
+    return Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], spec, config)
 
 
 # ---------------------------------------------------------------------- training runs

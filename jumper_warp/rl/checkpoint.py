@@ -35,6 +35,12 @@ class Checkpoint(NamedTuple):
     skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
     newest: str  # file name of the newest checkpoint in the folder when this one was loaded
 
+    @property
+    def seed(self) -> int | None:
+        """Seed of the checkpoint, of a run of several seeds; None: of a single training."""
+        name = self.path.parents[1].name
+        return int(name.removeprefix(SEED)) if name.startswith(SEED) else None
+
 
 def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_checkpoints: int = 3) -> Path:
     """Save a training's state as the file `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.

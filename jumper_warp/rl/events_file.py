@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jumper_warp.rl.resume import flat_settings
+from jumper_warp.rl.run_folder import flat_settings
 from jumper_warp.utils.files import Json
 
 BUFFER = 2**20  # [byte] More than the events of an iteration

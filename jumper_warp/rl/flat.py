@@ -94,12 +94,9 @@ class FlatAdam:
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:
         """Return copies of Adam's state of each parameter by its index, in the format of `torch.optim.Adam`."""
+        vectors = {"exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq}
         return {
-            index: {
-                "step": self.step_count.clone(),
-                "exp_avg": segment.view(self.exp_avg).clone(),
-                "exp_avg_sq": segment.view(self.exp_avg_sq).clone(),
-            }
+            index: {"step": self.step_count.clone()} | {name: segment.view(v).clone() for name, v in vectors.items()}
             for index, segment in enumerate(self.flat.segments)
         }
 

@@ -192,6 +192,22 @@ class Learner(ABC):
         self.lr.copy_(state["lr"]).clamp_(self.cfg.min_lr, self.cfg.max_lr)
         self.collector.episode.copy_(state["episode"])
 
+    def random_state(self) -> dict[str, torch.Tensor]:
+        """Return the states of torch's default random generators, `cpu` and `cuda`, and of the learner's.
+
+        The learner's is `learner_cpu` or `learner_cuda`, by its device.
+        """
+        state = {"cpu": torch.get_rng_state(), f"learner_{self.generator.device.type}": self.generator.get_state()}
+        return state | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_available() else {})
+
+    def set_random_state(self, state: dict[str, torch.Tensor]) -> None:
+        """Restore the result of `random_state`, apart from generators of another kind of device."""
+        torch.set_rng_state(state["cpu"])
+        if "cuda" in state and torch.cuda.is_available():
+            torch.cuda.set_rng_state(state["cuda"])
+        if (own := state.get(f"learner_{self.generator.device.type}")) is not None:
+            self.generator.set_state(own)
+
     def close(self) -> None:
         """Delete all CUDA graphs; required before the process group is destroyed."""
         for graph in (self._roll_graph, self._batch_graph, self._epochs_graph):

@@ -1,4 +1,4 @@
-"""Folder of a training run: creation, configuration, dumps of non-finite values, replacement if files are deleted."""
+"""Folder of a training run: creation, configuration and its changes on resuming, dumps of non-finite values."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.cfg import SESSION, TrainCfg
 from jumper_warp.rl.distributed import Rank, all_reduce_max
 from jumper_warp.rl.run_names import run_name
 from jumper_warp.utils.dumps import DUMPS, NonFiniteValue, write_dump
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
@@ -23,6 +24,15 @@ from jumper_warp.utils.sources import source_checksums
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 SOURCES = "sources"  # Folder in a run's folder that holds copies of the user's files
+FIXED = (
+    "best-metric", "run-name", "ppo.init-std", "ppo.normalise-value", "env.motors.lateral.peak",
+    "env.motors.transversal.peak", "robot.values.latency", "robot.values.motor-friction", "robot.values.paw-friction",
+)  # fmt: skip
+"""Settings that only the start of a training reads; scores of saved checkpoints are of its `best_metric`."""
+RANGES = ("env.randomization.", "robot.randomization.")  # Begins of the names of ranges of robot parameters
+REDRAWN = ("env.randomization.push", "env.randomization.resample-at", "env.randomization.type")
+"""Begins of the names in RANGES that apply during a training in any case."""
+DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's configuration that follow from other settings
 
 
 class TrainResult(NamedTuple):
@@ -69,6 +79,52 @@ def write_config(folder: Path, config: Json) -> None:
         source = Path(str(sys.modules[module].__file__))
         (folder / SOURCES).mkdir(exist_ok=True)
         write_atomically(folder / SOURCES / f"{module}.py", source.read_bytes())
+
+
+def changed_settings(saved: Json, config: Json) -> dict[str, str]:
+    """Return the settings that differ between two configurations of a run, as text `old -> new` by name."""
+    old, new = flat_settings(saved), flat_settings(config)
+    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    return {name: f"{old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in changed}
+
+
+def check_changes(changed: Iterable[str], config: Json) -> None:
+    """Raise InputError if a changed setting is read at the start of a training only, and so would have no effect.
+
+    Such settings are FIXED and, of robots that are nominal or sampled at startup, ranges and startup events.
+    """
+    env, fixed = config["env"], set(FIXED)
+    task = env.get("task", {})
+    if not env.get("randomize") or task.get("randomization", {}).get("resample_at") == "startup":
+        fixed |= {name for name in changed if name.startswith(RANGES) and not name.startswith(REDRAWN)}
+    startup = tuple(f"env.events.{event['name']}." for event in task.get("events", ()) if event["mode"] == "startup")
+    fixed |= {name for name in changed if name.startswith(startup)}
+    if names := [name for name in changed if name in fixed]:
+        raise InputError(f"{', '.join(names)} cannot change after the start of a training")
+
+
+def flat_settings(config: Json) -> Json:
+    """Return the settings in a run's configuration as a flat dict by flag name, without leading dashes."""
+    train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
+    env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
+    task = dict(config["env"].get("task", {}))
+    reset = dict(task.get("reset", {}))
+    settings = reset.pop("settings", None) or {}  # their flags omit this level
+    task["reset"] = reset | settings
+    return _flat(train) | _flat(env) | _flat(task, "env")
+
+
+def _flat(value: Any, name: str = "") -> Json:
+    """Flatten nested dicts: return their leaves by dotted name, such as `ppo.num-steps`.
+
+    Entries of lists are named by their key `name`.
+    """
+    if isinstance(value, list) and any(isinstance(part, dict) for part in value):
+        value = {part.get("name", str(i)): part for i, part in enumerate(value)}
+    if not isinstance(value, dict):
+        return {name: value}
+    parts = [_flat(part, f"{name}.{key}".strip(".").replace("_", "-")) for key, part in value.items()]
+    return {key: leaf for part in parts for key, leaf in part.items()}
 
 
 def report_non_finite(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import statistics
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
+from pathlib import Path
 from typing import Protocol
 
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl import distributed, seeds
+from jumper_warp.rl import distributed
 from jumper_warp.rl.actor_init import ActorInit
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import Checkpoint, check_unchanged, find_checkpoints
@@ -21,6 +25,7 @@ from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.rl.training_run import TrainingRun
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.locks import write_lock
+from jumper_warp.utils.metrics import mean
 from jumper_warp.utils.runtime import DeviceStream
 from jumper_warp.utils.threads import set_threads
 
@@ -75,7 +80,7 @@ def train(
         cleanup.enter_context(console)
         trainings, folder, each = [(cfg, checkpoints[0] if checkpoints else None)], None, rank
         if cfg.seeds:
-            trainings = seeds.trainings(cfg, checkpoints)
+            trainings = trainings_of_seeds(cfg, checkpoints)
             folder = checkpoints[0].path.parents[2] if checkpoints else new_folder(cfg, rank)
             leave_process_group()
             each = Rank(0, 1, rank.device)
@@ -108,15 +113,51 @@ def train(
             results = {run.cfg.seed: run.result() for run in runs}
             hint = f", continue with: {runs[0].resume_command}" if stop.requested else ""
             console.print_line(f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}")
-            for line in seeds.table(results, cfg.best_metric):
+            for line in seeds_table(results, cfg.best_metric):
                 console.print_line(line)
-            result = seeds.total(folder, results)
+            result = total_result(folder, results)
             failing = runs if rank.size == 1 else []  # an exit status of 1 would end the processes of the other seeds
         if failing and all(run.failure for run in failing):
             raise SystemExit(f"jumper: {failing[0].failure}")  # printed by Python, which exits with status 1
         if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
+
+
+def trainings_of_seeds(cfg: TrainCfg, checkpoints: Sequence[Checkpoint]) -> list[tuple[TrainCfg, Checkpoint | None]]:
+    """Return the settings of each seed to train, with its checkpoint; if any has one, seeds without one are left out.
+
+    Raises InputError: a seed is not in cfg.seeds, or the checkpoints are of a single training.
+    """
+    found = [checkpoint.seed for checkpoint in checkpoints if checkpoint.seed is not None]
+    if len(found) < len(checkpoints) or not set(found) <= set(cfg.seeds):
+        run = f"seeds {', '.join(map(str, sorted(found)))}" if found else "one seed"
+        raise InputError(f"the run to continue has {run}, got seeds {', '.join(map(str, cfg.seeds))}")
+    pairs = zip(found, checkpoints, strict=True) if found else ((seed, None) for seed in cfg.seeds)
+    return [(dataclasses.replace(cfg, seed=seed, seeds=()), checkpoint) for seed, checkpoint in pairs]
+
+
+def total_result(folder: Path, results: dict[int, TrainResult]) -> TrainResult:
+    """Return the result of all seeds: the largest iteration and time, and the means of the metrics that all have."""
+    values = list(results.values())
+    names = sorted(set.intersection(*(set(result.metrics) for result in values)))
+    means = {name: statistics.fmean(result.metrics[name] for result in values) for name in names}
+    return TrainResult(folder, max(r.iteration for r in values), max(r.seconds for r in values), means, results)
+
+
+def seeds_table(results: dict[int, TrainResult], metric: str) -> list[str]:
+    """Return lines with the last value of a metric and the mean reward of each seed, and their means over the seeds.
+
+    In brackets: 95 % bootstrap interval of the mean.
+    """
+    lines = [f"seed   {metric.removeprefix('Metrics/'):>10}   reward   iteration"]
+    for seed, result in results.items():
+        numbers = (result.metrics.get(name, float("nan")) for name in (metric, "Train/mean_reward"))
+        lines.append("{:<6} {:>10.3f} {:>8.2f} {:>11}".format(seed, *numbers, result.iteration))
+    measured = mean([result.metrics.get(metric, math.nan) for result in results.values()])
+    if len(results) > 1 and measured.interval is not None:
+        lines.append("mean   {:>10.3f} [{:.3f}, {:.3f}]".format(measured.value, *measured.interval))
+    return lines
 
 
 def iterate(runs: Sequence[TrainingRun], console: TrainingConsole, observers: Sequence[Observer] = ()) -> StopRequest:

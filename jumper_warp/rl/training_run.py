@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from jumper_warp.envs.vec_env import VecEnv
-from jumper_warp.rl import distributed, resume
+from jumper_warp.rl import distributed, run_folder
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
@@ -22,7 +22,7 @@ from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.learner import STATISTICS
 from jumper_warp.rl.logger import NoLog, Scores, Stopwatch, TrainingConsole, TrainingLog
-from jumper_warp.rl.run_folder import CONFIG, TrainResult, full_config, new_folder, report_non_finite, write_config
+from jumper_warp.rl.run_folder import CONFIG, TrainResult
 from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
@@ -55,7 +55,7 @@ class TrainingRun:
         losses = {f"Loss/{name}" for name in STATISTICS}
         self._logged = {*env.metrics(), *losses, *LEARNING, *PERF}  # Names of the logged metrics
         self.check_logged("best_metric", cfg.best_metric)
-        self.config = full_config(cfg, env, rank)
+        self.config = run_folder.full_config(cfg, env, rank)
         self.iteration = 0
         self.ended = False
         self.clock = TrainingClock(cfg)
@@ -76,11 +76,11 @@ class TrainingRun:
             self.folder = folder
             folder.mkdir(parents=True)
         else:
-            self.folder = new_folder(cfg, rank)
+            self.folder = run_folder.new_folder(cfg, rank)
         if self._is_single:
             self.notes.insert(0, f"run {self.folder}")
         if rank.index == 0:
-            write_config(self.folder, self.config)
+            run_folder.write_config(self.folder, self.config)
 
     def check_logged(self, name: str, metric: str) -> None:
         """Raise InputError, which begins with `name`, unless this training logs a metric."""
@@ -97,13 +97,16 @@ class TrainingRun:
         lines: list[str] = []
         try:
             saved = json.loads(state["config"])
-            changed = resume.changed_settings(saved, self.config)
+            changed = run_folder.changed_settings(saved, self.config)
             lines = [f"{name} {change}" for name, change in changed.items()]
-            resume.check_changes(changed, self.config)
+            run_folder.check_changes(changed, self.config)
             sources = changed_sources(saved["sources"], self.config["sources"])
             self.config["train"]["init_policy"] = saved["train"]["init_policy"]
-            local = resume.rank_state(state, self.rank)
-            resume.set_random_state(local["rng"], self.ppo.generator)
+            ranks = [state, *state["others"]]
+            if len(ranks) != self.rank.size:
+                raise InputError(f"saved by {len(ranks)} processes, resumed by {self.rank.size}")
+            local = ranks[self.rank.index]
+            self.ppo.set_random_state(local["rng"])
             self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
             self.env.load_state_dict(local["env"])
             self.clock.seconds = float(state.get("seconds", 0.0))
@@ -207,7 +210,9 @@ class TrainingRun:
         self._is_finite = self.ppo.is_finite()
         if not self._is_finite:
             self.failure = self.failure or "the weights are not finite; the last checkpoint is the one before"
-        found = report_non_finite(self.env, self.folder, self.config, self.iteration, print_line, self.rank.index)
+        found = run_folder.report_non_finite(
+            self.env, self.folder, self.config, self.iteration, print_line, self.rank.index
+        )
         if found and self.cfg.stop_on_nan:
             self.failure = self.failure or f"--stop-on-nan: {found[0]}"
 
@@ -237,11 +242,7 @@ class TrainingRun:
         It also holds the states of the other ranks' environments, so that a resumed training continues identically.
         """
         seconds = self.clock.elapsed()
-        local = {
-            "ppo": self.ppo.state_dict(),
-            "env": self.env.state_dict(),
-            "rng": resume.random_state(self.ppo.generator),
-        }
+        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": self.ppo.random_state()}
         others = distributed.other_states(local, self.rank)
         if self.rank.index != 0:
             return
@@ -251,7 +252,7 @@ class TrainingRun:
         try:
             if not (self.folder / CONFIG).is_file():  # the run's folder was deleted
                 self.folder.mkdir(parents=True, exist_ok=True)
-                write_config(self.folder, self.config)
+                run_folder.write_config(self.folder, self.config)
             path = save_checkpoint(folder, state, self._scores.mean(), self.cfg.max_checkpoints)
         except OSError as error:
             if is_last:

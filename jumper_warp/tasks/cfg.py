@@ -25,7 +25,6 @@ from jumper_warp.tasks import terms
 from jumper_warp.tasks.copying import Copyable, Struct
 from jumper_warp.tasks.evaluation import EpisodeEvaluation, Evaluation
 from jumper_warp.tasks.functions import check_result, check_values, place_of, shown_type
-from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
 from jumper_warp.utils.checks import MOST_SETTING, NAME, check_bounds, check_types
@@ -244,13 +243,13 @@ class TaskCfg(Copyable):
                 check_result(f"{self.name} {where}", func, takes, returns)
 
     @functools.cached_property
-    def params(self) -> TaskParams:
+    def params(self) -> terms.TaskParams:
         """Parameters of all terms by section: "advance", "curriculum", "rewards", "observations.actor" and so on."""
         sections = {"advance": (self.advance,), "curriculum": (self.curriculum,), "rewards": self.rewards,
                     "terminations": self.terminations, "observations.actor": self.observations.actor,
                     "observations.critic": self.observations.critic,
                     "events": (*self.randomization.events(), *self.events)}  # fmt: skip
-        return TaskParams(self.name, sections)
+        return terms.TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
         """Return the columns of each term in the actor's or critic's observation as half-open ranges (first, end).

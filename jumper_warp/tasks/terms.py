@@ -1,14 +1,16 @@
 """Terms of a task, such as rewards: a Warp function and its parameters by name, checked when a term is created.
 
 The first arguments of a function come from the kernel; its other parameters, all float, are numbers of the term. All
-numbers of a task lie in one array on the device, so that each can change while a captured graph replays.
+numbers of a task lie in one array on the device, so that each can change while a captured graph replays. Each has a
+name, such as `rewards.jump_height.weight` or `observations.actor.lin_vel.noise`, and kernels index it by `TermSlot`.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self, get_type_hints
 
 import warp as wp
@@ -66,7 +68,8 @@ class Term(Copyable):
         self.func = func
         self.name = name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
-        self._check_types(f"{place_of(func)}: {where}")
+        if reason := self._misfit():
+            raise InputError(f"{place_of(func)}: {where}: {reason}")
         python: Any = func.func
         params = list(inspect.signature(python).parameters.values())[len(self._leading()) :]
         known = self.settings | {p.name: p.default for p in params}
@@ -95,18 +98,17 @@ class Term(Copyable):
             self.options[key] = bool(self.options[key])
         self.num_params = len(params)
 
-    def _check_types(self, where: str) -> None:
-        """Raise InputError unless the function has an allowed first argument (`takes`) and result (`returns`)."""
+    def _misfit(self) -> str:
+        """Return why the function has no allowed first argument (`takes`) or result (`returns`); empty: it has both."""
         if not self._leading():
-            takes = " or ".join(kinds[0].key for kinds in self.takes)
-            raise InputError(f"{where}: the first argument of the function must be annotated {takes}")
+            return f"the first argument of the function must be annotated {' or '.join(t[0].key for t in self.takes)}"
         try:
             returned = get_type_hints(self.func.func).get("return", REQUIRED)
         except NameError as error:
-            raise InputError(f"{where}: an annotation of the function has an {error}") from None
-        if returned is not REQUIRED and not self._may_return(returned):
-            annotated = shown_type(returned)
-            raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
+            return f"an annotation of the function has an {error}"
+        if returned is REQUIRED or self._may_return(returned):
+            return ""
+        return f"the function must return {self.returned}, its annotation is {shown_type(returned)}"
 
     def _leading(self) -> tuple[object, ...]:
         """Return the types of the leading arguments, from `takes`, that fit the term's function; empty: none do."""
@@ -358,3 +360,62 @@ class StateMetric:
         check_types("metric", self)
         if "/" not in self.name:
             object.__setattr__(self, "name", f"Metrics/{self.name}")
+
+
+class TermSlot(SimpleNamespace):
+    """Indices of a term's parameters (such as a reward's weight) in the task's parameter array, and the term's options.
+
+    Kernels use it; the array p is that of `TaskParams.values`. Each name in the term's `settings` is an attribute, the
+    index of its value (of a pair: the first): `p[slot.weight]`. Each name in its `options` is an attribute with the
+    option's value.
+    """
+
+    def __init__(self, term: Any, offset: int) -> None:
+        """Store the term's indices and options; offset: index of the term's first number in the array."""
+        numbers = list(term.flat_numbers)
+        settings = numbers[: len(numbers) - term.num_params]
+        super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
+        self.term = term
+        self.func = term.func
+        self.first = offset
+        self.start = offset + len(settings)
+        self.stop = offset + len(numbers)
+        """Half-open range of the function's parameters: `*p[slot.start : slot.stop]`."""
+        self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
+        """Parts of the term that are compiled into a kernel; tasks with equal tuples share the kernel."""
+
+
+class TaskParams:
+    """Parameters of all terms of a task, such as weights of rewards, in one list, and the index of each by name."""
+
+    def __init__(self, task: str, sections: Mapping[str, Sequence[Term]]) -> None:
+        """Collect the parameters of all terms; task: name, for messages; sections: terms by name of their section."""
+        self.task = task
+        self.slots: dict[str, list[TermSlot]] = {section: [] for section in sections}
+        """Slots by section, one per term, in the order of the terms."""
+        self.values: list[float] = []
+        self.names: dict[str, int] = {}
+        """Index of each number in `values` by dotted name; the first if a randomisation and an event share a name."""
+        for section, terms in sections.items():
+            for term in terms:
+                self.slots[section].append(TermSlot(term, len(self.values)))
+                for key, value in term.flat_numbers.items():
+                    self.names.setdefault(f"{section}.{term.name}.{key}", len(self.values))
+                    self.values.append(float(value))
+
+    def checked(self, numbers: Sequence[float], i: int) -> float:
+        """Return number `i` of a list like `values` as its term stores it. Raises InputError: it is out of bounds."""
+        slot = next(slot for slots in self.slots.values() for slot in slots if slot.first <= i < slot.stop)
+        term = slot.term.with_flat_numbers(numbers[slot.first : slot.stop])
+        return list(term.flat_numbers.values())[i - slot.first]
+
+    def index(self, name: str) -> int:
+        """Return the index of a term's parameter by its dotted name. Raises InputError: there is none."""
+        if not isinstance(name, str):
+            raise InputError(f"the name of a number must be text like rewards.jump_height.weight, got {name!r:.60}")
+        if name not in self.names:
+            section, _, rest = name.partition(".")
+            term, _, key = rest.rpartition(".")
+            missing = f"has no number {key!r} of a {section} term {term!r}"
+            raise InputError(f"{self.task} {missing}; names are like rewards.jump_height.weight")
+        return self.names[name]

@@ -1,6 +1,6 @@
 """Kernel that runs a task's events (changes of robot parameters): at startup, at resets and at intervals.
 
-Events are domain randomisation: masses, friction, gains, latency, pushes. `TermSlot`s (`jumper_warp.tasks.params`) name
+Events are domain randomisation: masses, friction, gains, latency, pushes. `TermSlot`s (`jumper_warp.tasks.terms`) name
 an event's function and the places of its numbers in `p`, so that a number can change without another kernel.
 """
 
@@ -8,10 +8,9 @@ import warp as wp
 
 from .durations import whole_steps
 from .env import EpisodeArrays
-from .options import FAST
+from .factory import unrolled_kernel
 from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
-from .unroll import unrolled
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2  # stages at which `event_kernel` is launched
 LANES = 8  # Threads of a GPU that share the loops of an event
@@ -81,4 +80,4 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                 if due:
                     wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)])
 
-    return wp.kernel(unrolled(event_kernel), module="unique", module_options=FAST)
+    return unrolled_kernel(event_kernel)

@@ -9,11 +9,10 @@ import warp as wp
 
 from ..kinematics.geometry import LegGeometry, leg_of
 from ..terrain.ground import Ground
+from .factory import unrolled_kernel
 from .observe import store
-from .options import kernel_name
 from .parameters import RobotParameters
 from .track import paw_clearance, paw_motion
-from .unroll import unrolled
 from .view import RobotArrays, load_view
 
 OPTIONS: dict[str, Any] = {"enable_backward": True, "fast_math": True}
@@ -66,8 +65,7 @@ def make_gradient_kernel(task: Any) -> wp.Kernel:
                     wp.static(rows[i]), world, raw,
                 )  # fmt: skip
 
-    name = kernel_name("gradient_kernel", task.state)
-    return wp.kernel(unrolled(gradient_kernel), name=name, module="unique", module_options=OPTIONS)
+    return unrolled_kernel(gradient_kernel, task.state, options=OPTIONS)
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)

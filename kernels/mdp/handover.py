@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from .env import BEGUN, EpisodeArrays, Scene, SkillSettings
-from .options import kernel_name
+from .factory import kernel_name
 from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view, yaw_of
 

@@ -11,11 +11,10 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import BEGUN, COMMANDED, RING, EpisodeArrays
+from .factory import FAST, unrolled_kernel
 from .non_finite import NonFinite, record_non_finite
-from .options import FAST, kernel_name
 from .parameters import RobotParameters
 from .random import OBSERVATION, normal, step_key, stream_at
-from .unroll import unrolled
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -160,8 +159,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                         states, found_states,
                     )  # fmt: skip
 
-    name = kernel_name("observe_kernel", task.state)
-    return wp.kernel(unrolled(observe_kernel), name=name, module="unique", module_options=FAST)
+    return unrolled_kernel(observe_kernel, task.state)
 
 
 LIMIT = wp.constant(100.0)  # largest absolute value of an observation [1]

@@ -15,7 +15,7 @@ from ..layout import BODIES, COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings, launched_world
-from .options import FAST, kernel_name
+from .factory import FAST, kernel_name
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of

@@ -13,9 +13,8 @@ import warp as wp
 from ..terrain.ground import Ground
 from . import terminations
 from .env import BEGUN, Counters, EpisodeArrays
+from .factory import unrolled_kernel
 from .non_finite import NonFinite, record_non_finite
-from .options import FAST, kernel_name
-from .unroll import unrolled
 from .view import RobotArrays, has_diverged, is_finite, load_view
 
 NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
@@ -186,5 +185,4 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                         found, i, value, world, episode, arrays, observed, term_value, states, found_states
                     )
 
-    name = kernel_name("step_kernel", task.state)
-    return wp.kernel(unrolled(step_kernel), name=name, module="unique", module_options=FAST)
+    return unrolled_kernel(step_kernel, task.state)

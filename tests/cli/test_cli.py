@@ -121,7 +121,7 @@ def test_flags_set_training_and_task_settings_outside_terms():
         " --env.randomization.latency None --env.action-scale 10 80 --env.contact-force 0.2 --env.reward-floor None"
         " --ppo.gamma 0.9 --no-noise --solver mujoco"
     )
-    recipe, _ = parse_train(["Olympus-Vertical-Jump", *flags.split()])
+    recipe = parse_train(["Olympus-Vertical-Jump", *flags.split()])[0]
     task = recipe.task
     assert {term.name: term for term in task.observations.actor}["gravity"].options["history"] == 2
     assert task.reset.settings.start_probability.standing == 0.45 and task.reset.settings.ground.drop == (0.1, 0.2)

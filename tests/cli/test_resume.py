@@ -10,6 +10,7 @@ from jumper_warp.cli import main as cli
 from jumper_warp.cli.train import parse_train
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.training import make_env
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
 SAVED = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
@@ -86,18 +87,17 @@ def test_robot_flag_overrides_the_robot_of_the_run(run, tmp_path):
     RobotOverlay({"spring_stiffness": (700.0,), "spring_length": (0.1,)}).save(tmp_path / "stiffer.json")
     overridden = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])[0]
     for recipe, stiffness in ((parse_train(["vertical-jump", "--resume", str(run)])[0], 600.0), (overridden, 700.0)):
-        saved = recipe.make_env(2, 0, "cpu").config()["robot"]
-        assert saved["values"]["spring_stiffness"] == [stiffness]
+        assert make_env(recipe, 2, 0, "cpu").overlay.values["spring_stiffness"] == (stiffness,)
 
 
 def test_solver_of_the_run_is_restored_and_missing_settings_have_defaults(run):
     path = run / "checkpoints" / "iteration_000001.pt"
     state = load_checkpoint(path)
     saved = json.loads(state["config"])
-    saved["env"] = {key: value for key, value in saved["env"].items() if key not in ("noise", "randomize")}
+    del saved["env"]["noise"], saved["env"]["randomize"]
     saved["env"]["solver"] = "SolverMuJoCo"
     save_checkpoint(path.parent, state | {"config": json.dumps(saved)})
-    recipe, _ = parse_train(["vertical-jump", "--resume", str(run)])
+    recipe = parse_train(["vertical-jump", "--resume", str(run)])[0]
     assert (recipe.solver, recipe.noise, recipe.randomize, recipe.task.gravity) == ("mujoco", True, True, 3.71)
     assert parse_train(["vertical-jump", "--resume", str(run), "--solver", "jumper"])[0].solver == "jumper"
 

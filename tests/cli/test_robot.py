@@ -12,6 +12,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, torque_limit
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.folder import read_robot
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.training import make_env
 from jumper_warp.utils.output import read_values
 
 HEAVY = 3.0
@@ -54,8 +55,7 @@ def test_torque_limit_metric_includes_the_overlay(tmp_path):
 
 
 def test_training_uses_and_saves_the_overlay(overlay):
-    recipe, _ = parse_train(["vertical-jump", "--robot", str(overlay), "--no-randomize"])
-    env = recipe.make_env(2, 0, "cpu")
+    env = make_env(parse_train(["vertical-jump", "--robot", str(overlay), "--no-randomize"])[0], 2, 0, "cpu")
     saved = RobotOverlay.from_json(json.loads(json.dumps(env.config()))["robot"])
     assert base_mass(env) == pytest.approx(saved.values["base_mass"][0]) and saved.values["kp"][0] == 0.8
     assert saved.randomization == {"base_mass": (-0.1, 0.1)}

@@ -4,6 +4,7 @@ import json
 import pytest
 
 import hold_height
+from jumper_warp.evaluation.conditions import evaluated_task
 from jumper_warp.kernels.jump import rewards, terminations
 from jumper_warp.policies.spec import PolicyInterface, make_interface
 from jumper_warp.recipe import Recipe
@@ -53,15 +54,14 @@ def whole(config):
 
 def nominal(config):
     """Return the task in a configuration for a nominal test."""
-    return Recipe.from_json(config, [], complete=False).tested_task(randomize=False)
+    return evaluated_task(Recipe.from_json(config, [], complete=False), randomize=False)
 
 
 def test_restored_task_equals_the_saved_one(saved):
     task, config = saved
     assert whole(config) == task != make_task("vertical-jump")
-    assert nominal(config) == dataclasses.replace(
-        task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
-    )
+    observations = dataclasses.replace(task.observations, critic=())
+    assert nominal(config) == dataclasses.replace(task, rewards=(), observations=observations, events=())
 
 
 def test_missing_setting_gets_its_default(saved):

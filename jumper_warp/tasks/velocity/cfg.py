@@ -34,6 +34,9 @@ VELOCITY_COMMAND = Command(
 class VelocityEvaluation(Evaluation):
     """Evaluation of velocity tracking on level ground, with commands from a grid of velocities."""
 
+    max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z, in both directions."""
+
     flags: ClassVar = "jumper_warp.evaluation.velocities:Velocity"
     published: ClassVar = {
         "slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12

@@ -14,12 +14,13 @@ from dataclasses import replace
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.kernels.velocity import rewards
+from jumper_warp.robot.gravity import MARS
 from jumper_warp.robot.terrain import KINDS, TerrainCfg
 from jumper_warp.tasks.cfg import ObservationsCfg, TaskCfg
 from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.tasks.units import DEG
-from jumper_warp.tasks.velocity.cfg import CommandCfg
+from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityEvaluation
 from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
 ACTOR = remembered(WITHOUT_HISTORY, 8)  # Policy observation: over eight policy steps, or 0.13 s
@@ -61,3 +62,11 @@ def velocity_rough() -> TaskCfg:
     )
     direct = RewardTerm(rewards.lin_vel_xy_l1, -1.0)
     return replace(task, rewards=(*task.rewards, direct, *STEPS_UP), reward_floor=None)
+
+
+def velocity_mars() -> TaskCfg:
+    """Return the task of velocity tracking on the terrain map under the gravity of Mars, with slower commands."""
+    reach = (0.8, 0.8, 0.6, 1.0)
+    commands = replace(COMMANDS, first_range=reach, last_range=reach)
+    evaluation = VelocityEvaluation((0.6, 0.5, 0.8))
+    return replace(velocity_rough(), name="velocity-mars", gravity=MARS, levels=(commands,), evaluation=evaluation)

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from jumper_warp.kernels.mdp.unroll import unrolled
+from jumper_warp.kernels.mdp.factory import unrolled
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""Unrolling of loops in kernel functions, so that Warp finds a cached kernel without building it first."""
+"""Kernels made of a task's functions: their options and names, and the unrolling of their loops over terms."""
 
 import ast
 import hashlib
@@ -8,6 +8,34 @@ import textwrap
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
+
+import warp as wp
+
+FAST: dict[str, Any] = {"enable_backward": False, "fast_math": True}
+"""Warp module options; fast_math: GPU divisions, roots, exponentials are exact to 2 units in the last place."""
+
+_definitions: dict[str, list] = {}  # structs by their key, in the order of their definitions
+
+
+def kernel_name(name: str, *structs: Any) -> str | None:
+    """Return a kernel name that distinguishes structs of equal names, or None where Warp's default name suffices.
+
+    If a struct is defined again, for example in a notebook's cell, its kernels need another name. Otherwise Warp
+    returns the kernels with equal code, whose arguments have the earlier struct.
+    """
+    numbers = []
+    for struct in structs:
+        known = _definitions.setdefault(struct.key, [])
+        if not any(struct is other for other in known):
+            known.append(struct)
+        numbers.append(next(i for i, other in enumerate(known) if struct is other))
+    return "_".join([name, *map(str, numbers)]) if any(numbers) else None
+
+
+def unrolled_kernel(function: Callable[..., None], *structs: Any, options: dict[str, Any] = FAST) -> wp.Kernel:
+    """Return the kernel of a Python function whose loops over terms are `unrolled`; structs: see `kernel_name`."""
+    name = kernel_name(function.__name__, *structs)
+    return wp.kernel(unrolled(function), name=name, module="unique", module_options=options)
 
 
 def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> Any:
