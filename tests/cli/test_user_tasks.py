@@ -39,9 +39,7 @@ def too_high(robot: mdp.RobotView, state: Any, height: float) -> bool:
 
 def tame_jump():
     task = make_task("vertical-jump")
-    return replace(
-        task, name="tame-jump", rewards=(mdp.RewardTerm(base_at_rest, 2.0, height=0.5), *task.rewards[:3])
-    )
+    return replace(task, name="tame-jump", rewards=(mdp.RewardTerm(base_at_rest, 2.0, height=0.5), *task.rewards[:3]))
 
 def low_jump():
     task = tame_jump()

@@ -157,11 +157,8 @@ ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsiz
 
 
 @pytest.mark.parametrize(
-    ("about", "ticks"),
-    [
-        ([1], 3), (ABOUT | {"rate": 0}, 3), ({"version": 1}, 3), (ABOUT, 0), (ABOUT, -3),
-    ],
-)  # fmt: skip
+    ("about", "ticks"), [([1], 3), (ABOUT | {"rate": 0}, 3), ({"version": 1}, 3), (ABOUT, 0), (ABOUT, -3)]
+)
 def test_damaged_log_is_refused(about, ticks, tmp_path):
     """A negative number of ticks: they have a request that does not exist."""
     records = np.zeros(abs(ticks), TICK)

@@ -11,6 +11,7 @@ from experiments import (
     demo,
     gradient_cost,
     leg_springs,
+    mujoco_policy,
     new_reward,
     rescue,
     solver_accuracy,
@@ -70,6 +71,11 @@ def test_template_measures_the_landing_error_over_friction(tmp_path):
     assert nominal < 0.05 < slippery
     for name in ("metrics.json", "friction.png", "friction_0.3.rrd", "friction_0.8.png"):
         assert (tmp_path / name).stat().st_size > 1000, name
+
+
+def test_policy_jumps_and_stands_in_plain_mujoco(tmp_path):
+    values = mujoco_policy.main(mujoco_policy.Args(height=0.8, seconds=5.0, out=tmp_path))
+    assert abs(values["apex_m"] - 0.8) < 0.01 and 0.30 < values["height_at_end_m"] < 0.35
 
 
 # ---------------------------------------------------------------- the sweep
