@@ -10,8 +10,9 @@ The robot starts in the default pose, and gets its command after half a second. 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
-import mujoco
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,7 @@ from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.output import output_dir
 from support.scripts import OutputArgs, report, run_script
 
+mujoco: Any = import_module("mujoco")
 RATE, SUBSTEPS, START = 60, 8, 30  # [Hz] Policy steps, physics steps in each, policy step of the command
 
 
@@ -37,8 +39,8 @@ class Args(OutputArgs):
     seconds: float = 8.0  # [s] Length of the run
 
 
-def make_robot(policy: DeployedPolicy, gravity: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return model and state of the robot in the default pose, with the policy's gains and torque limits."""
+def make_robot(policy: DeployedPolicy, gravity: float) -> tuple[Any, Any]:
+    """Return MjModel and MjData of the robot in the default pose, with the policy's gains and torque limits."""
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "jumper" / "jumper.xml"))
     model.opt.gravity[2] = -gravity
     stiffness, damping, limit = (policy.interface[key] for key in ("joint_stiffness", "joint_damping", "torque_limit"))
