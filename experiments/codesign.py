@@ -230,10 +230,14 @@ def main(args: Args) -> Json:
     jumps = jumps_of(args, 1)
     scale = load_description().mass * gravity * distance
 
+    # 6.0: weight of the relative violation of a constraint; 0.1: weight of `Jump.faults`
     def least(jump: Jump) -> torch.Tensor:
+        """Return the costs [1] (n,) of jumps over `distance` [m] with the least energy, in units of `scale` [J]."""
         return jump.energy / scale + 6.0 * (1.0 - jump.distance / distance).clamp(min=0.0) + 0.1 * jump.faults
 
     def farthest(jump: Jump) -> torch.Tensor:
+        """Return the costs [1] (n,) of jumps as far as possible with at most the energy of the nominal leg's jump."""
+        # `values` is assigned below, before the first call
         energy = values["nominal_energy_j"]
         return 6.0 * (jump.energy / energy - 1.0).clamp(min=0.0) - jump.distance / distance + 0.1 * jump.faults
 

@@ -78,7 +78,7 @@ def joint_targets(step: int, offsets: np.ndarray | float = 0.0) -> np.ndarray:
 class Simulation:
     """Simulation of the push-off, with gradients.
 
-    `scores(offsets, length)` yields the scalar after each physics step; `forward` and `gradient` are what is timed.
+    `scores(offsets, length)` yields the scalar [m] after each physics step; `forward` and `gradient` are what is timed.
     """
 
     steps = DOUBLE_STEPS
@@ -87,7 +87,10 @@ class Simulation:
     gradient: Callable[[int], np.ndarray]
 
     def values(self, offsets: np.ndarray, lengths: tuple[int, ...]) -> np.ndarray:
-        """Return the scalars after each length, (n, lengths), for offsets (n, 12)."""
+        """Return the scalars [m] after each length, (n, lengths), for offsets [rad] (n, 12).
+
+        lengths: numbers of physics steps from 1 on, ascending and distinct; columns have their order.
+        """
         runs = (enumerate(self.scores(row, max(lengths)), 1) for row in offsets)
         return np.array([[score for step, score in run if step in lengths] for run in runs])
 
@@ -96,7 +99,7 @@ class Simulation:
         return self.values(OFFSETS[None], (length,))
 
     def differences(self, step: float, lengths: tuple[int, ...]) -> np.ndarray:
-        """Return central differences of the scalars by the offsets, (lengths, 12)."""
+        """Return central differences [m/rad] of the scalars by the offsets, (lengths, 12); step [rad]."""
         moves = step * np.eye(12)
         upper, lower = np.split(self.values(OFFSETS + np.concatenate([moves, -moves]), lengths), 2)
         return (upper - lower).T / (2.0 * step)
@@ -124,7 +127,7 @@ class Ours(Simulation):
         return self._run(self._one, OFFSETS[None], length)
 
     def values(self, offsets: np.ndarray, lengths: tuple[int, ...]) -> np.ndarray:
-        """Return the scalars of 24 worlds."""
+        """Return the scalars [m] of 24 worlds; lengths: as in `Simulation.values`, multiples of `Rollout.substeps`."""
         run = self._run(self._exact, offsets, max(lengths))
         rows = [length // self._exact.substeps for length in lengths]
         return (run.q.numpy()[rows, 2] + SPEED_WEIGHT * run.qd.numpy()[rows, 2]).T

@@ -113,7 +113,11 @@ class Bench:
         return trajectory(rows)
 
     def directly(self, state: State, commands: np.ndarray, steps: int) -> dict[str, np.ndarray]:
-        """Run a skill in direct simulation; arguments and result as in `over_bus`."""
+        """Run a skill in direct simulation; arguments and result as in `over_bus`.
+
+        All `len(commands) * steps` policy steps are run. `over_bus` leaves a command early when a jump ends or a fault
+        occurs. The `Runtime` only loads the skills: `tick` is never called.
+        """
         sim = self.direct[state]
         sim.reset()
         runtime = Runtime(self.bundle, self.link)

@@ -180,9 +180,11 @@ def checked_worlds(worlds: object, num_envs: int) -> np.ndarray:
 def checked_commands(commands: object, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
     """Check that commands are valid for a task, and return them as float32 (num_envs, 4), padded with zeros.
 
-    mask: (num_envs,), nonzero for worlds to command.
-    commands: one row, or one per world, valid for at least one task: which one a world has is known only on the
-    device. Raises InputError: they are valid for none.
+    mask: (num_envs,), nonzero for worlds to command; bounds are checked only there.
+    commands: integers or floating-point numbers, (n,) for all worlds or (num_envs, n), valid for at least one task:
+    which one a world has is known only on the device. n is 1 to 4, since kernels read the values as a `wp.vec4`.
+    tasks: at least one. Raises InputError: not an array of real numbers, or the first task's error if commands are
+    valid for none.
     """
     array = real_array(commands, "commands")
     n = len(mask)

@@ -217,6 +217,8 @@ class TaskRuntime:
         episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean sum, of a task without a time limit.
         `Episode_Termination/<term>`: fraction of the ended episodes. `Metrics/success`: fraction of the episodes that
         the curriculum counts; `Metrics/error_of_successes_<unit>`: mean curriculum error of the successful ones.
+        `Metrics/bad_actions`: number of policy steps with a non-finite action, over all worlds. Each `StateMetric` of
+        the task adds its `name`. One with `per` also sets its two fields in the task states of all worlds to 0.
         """
         task = self.task
         counters = self.counters
@@ -224,6 +226,7 @@ class TaskRuntime:
         endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
         limit = self._max_episode_length_s
+        # not strict: `term_sum` has one row, which stays 0, if the task has no rewards
         for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
             metrics[f"Episode_{'Reward' if limit else 'Sum'}/{term.name}"] = float(total) / ended / (limit or 1.0)
         for term, count in zip(task.terminations, endings, strict=True):

@@ -37,8 +37,8 @@ class EpisodeLog(EvaluationLog):
     start_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the start, world frame
     end_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the end, world frame
 
-    row_name = "episode"
-    spacing = 2.0
+    row_name = "episode"  # Noun for a trial, see `EvaluationLog`
+    spacing = 2.0  # [m] Distance between robots that a recording shows side by side
 
     def __post_init__(self) -> None:
         """Allocate results of one episode per world, NaN or -1 until they are known."""
@@ -60,6 +60,7 @@ class EpisodeLog(EvaluationLog):
         if self.commands.shape[1]:
             env.evaluation_reset(self.commands)
         else:
+            # past the last curriculum level, for which a reset samples one of all levels, see `make_reset_kernel`
             env.episodes.level.fill_(len(self.task.levels))
             env.reset()
         arrays = env.task_arrays()

@@ -195,6 +195,9 @@ def _verified(folder: Path, manifest: Mapping[str, Any]) -> dict[str, bytes]:
 def write_files(folder: Path, files: Mapping[str, bytes], old: Mapping[str, bytes]) -> None:
     """Write files of a policy (name to content) and its manifest; old: the folder's files, which the manifest keeps.
 
+    An empty `old` means a new folder: its manifest is written last, and without one the folder is not a policy. Other
+    processes may read an existing folder meanwhile. The caller holds `directory_lock` of the folder's parent, unless no
+    other process or thread writes to the folder.
     Raises PolicyError: a name is not that of a file in a folder. OSError: the disk is full or the folder cannot be
     written.
     """

@@ -250,7 +250,13 @@ def _policy_of_rsl_rl(state: Json) -> Policy:
 
 
 def _policy_of_checkpoint(state: Json) -> Policy:
-    """Return the policy in a checkpoint of this package; a mirror-symmetric actor becomes a plain network."""
+    """Return the policy in a checkpoint of this package; a mirror-symmetric actor becomes a plain network.
+
+    state: `config`, the run's settings as JSON text; `iteration`; `ppo`, whose `model` is the state_dict of networks
+    and running moments. Only a symmetric actor has the buffers `mirror_<name>_order` and `mirror_<name>_signs`; name:
+    obs or action. Raises PolicyError and TaskError as `_policy_of_weights`. Raises one of DECODE_ERRORS: an entry is
+    missing or of another type; `_policy_of_run` converts it to a CheckpointError.
+    """
     config = parse_json(state["config"], "config")
     model = state["ppo"]["model"]
     layers = _actor_layers(model, "actor.")

@@ -244,7 +244,11 @@ def _summary(seeds: Sequence[dict[str, float]]) -> str:
 
 
 def _mean_over(seeds: Sequence[dict[str, float]], name: str, form: str, interval: str) -> str:
-    """Return the mean of a metric over seeds as text, in brackets its interval if there are several; "": not logged."""
+    """Return the mean of a metric over seeds as text, in brackets its interval if there are several; "": not logged.
+
+    form: format string of the mean, such as "reward {:.2f}"; interval: of the lower and upper end, such as
+    "[{:.2f}, {:.2f}]". The mean is over the finite values. Without any, the first value (NaN or infinite) is formatted.
+    """
     values = [metrics[name] for metrics in seeds if name in metrics]
     if not values:
         return ""

@@ -54,9 +54,14 @@ SHELL_HALF = wp.constant(mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 
 
 @wp.struct
 class LegCapsules:
-    """Capsules that model the links of one leg, in the body frame."""
+    """Capsules that model the links of one leg, in the body frame.
 
-    ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, paw
+    Links 0 to 4 are outer thigh, inner thigh, outer shank, inner shank, paw. The capsule of link k goes from row k of
+    `ends` to row `capsule_end(k)`, and has the radius `capsule_radius(capsules, k)`. Five rows suffice, because
+    neighbouring links share an end.
+    """
+
+    ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, centre of the paw
     low: vec3  # [m] smallest x, y and z of the ends
     high: vec3  # [m] largest x, y and z of the ends
     hip: vec3  # [m] see `LegGeometry`
@@ -243,7 +248,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
     thigh = real(FAR)
     knee = real(FAR)
     shank = real(FAR)
-    ankle_world = pos + rotation * capsules.ends[4]
+    paw_world = pos + rotation * capsules.ends[4]
     for i in range(rolled(12)):
         k = i // 6
         part = i % 6  # of the link: axis, middle of the thigh, knee, three points of the shank
@@ -254,7 +259,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
         if part == 1:
             point = real(0.5) * (point + knee_world)
         if part > 2:
-            point = knee_world + SHANK_FREE * real(part - 2) / real(3.0) * (ankle_world - knee_world)
+            point = knee_world + SHANK_FREE * real(part - 2) / real(3.0) * (paw_world - knee_world)
         distance = ground_distance(ground, point)
         if part < 2:
             thigh = wp.min(thigh, distance)

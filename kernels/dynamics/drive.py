@@ -19,15 +19,21 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Drive:
-    """Inputs that drive the robots, constant in a kernel launch: motor targets, joint forces, wrench on the base."""
+    """Inputs that drive the robots, constant in a kernel launch: motor targets, joint forces, wrench on the base.
 
-    closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
+    `joint_f` and `body_f` have the layout of Newton's arrays, flat over worlds. Entries 0 to 5 of a world's `joint_f`
+    are a wrench on the base at its com, world axes: force x, y, z [N], moment x, y, z [N m]. It is added to the wrench
+    in `body_f`, see `base_wrench`. The entries of the motors are torques [N m], see `applied_torque`: they are added to
+    the feedback torques if `closed_loop` is 1. The entries of knees and loop joints are not read.
+    """
+
+    closed_loop: int  # 1: the motors follow `target`; 0: motor torques are those in `joint_f`
     motors: MotorArrays
     target: wp.array2d(dtype=real)  # [rad], (12, num_worlds)
     previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed during the first `delay` steps
     delay: wp.array(dtype=int)  # physics steps until `target` is followed, (num_worlds,); empty: 0
-    joint_f: wp.array(dtype=real)  # [N m] and, for the base, world wrench at its com; Newton's layout
-    body_f: wp.array(dtype=wp.spatial_vector)  # world wrench at the com of each body; the base's is used
+    joint_f: wp.array(dtype=real)  # (DOFS num_worlds,), base wrench [N], [N m] and motor torques [N m]
+    body_f: wp.array(dtype=wp.spatial_vector)  # (BODIES num_worlds,), force [N], moment [N m]; only the base's is read
 
 
 @wp.struct

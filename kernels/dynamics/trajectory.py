@@ -233,8 +233,9 @@ def filter_commands(
 ):  # fmt: skip
     """Apply the command filter to a leg's targets [rad] of policy step `step`, and write the filtered targets.
 
-    angles [rad], rates [rad/s]: at the start of the policy step. filtered_target: (T, 12, num_worlds). Without a filter
-    the targets are copied.
+    angles [rad], rates [rad/s]: true values at the start of the policy step; lateral, outer, inner. The filter reads
+    the measured angles: the true angles plus `actuation.motors.offset`, as the motors' controller does.
+    filtered_target: (T, 12, num_worlds). Without a filter the targets are copied.
     """
     m = 3 * leg
     target = row_vec3(commands.target, step, m, world)

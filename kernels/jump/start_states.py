@@ -289,7 +289,12 @@ def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBas
 
 @wp.func
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
-    """Return the base's sampled pose and velocity for the start mode; `sample_valid_state` calls it."""
+    """Return the base's sampled pose and velocity for the start mode; `sample_valid_state` calls it.
+
+    The start mode is not DEFAULT: `write_start` writes the default pose without sampling. attempt: unused, as `rng`
+    is already the attempt's own stream; it is part of the signature in `sample_valid_state`. Positions are sampled with
+    heights above the ground at the origin. The ground's height is added at the end: `pos` is in the world frame.
+    """
     base = JumpBase()
     if start.start_mode == STANDING:
         base = standing_base(start, rng)

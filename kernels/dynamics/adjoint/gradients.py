@@ -226,14 +226,22 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient w.r.t. the command filter's limits of one angle or sum to `sums`; hard zones have gradient 0."""
+    """Add the gradient w.r.t. the command filter's limits of one angle or sum of angles to a world's gradient.
+
+    Rows `row` to `row` + 3 are lower, upper, lower_zone, upper_zone, as in `load_limits`. The last two stay 0: the
+    filter is piecewise constant in the widths of its hard zones, in which it ignores speed (see `command_filter`).
+    """
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 
 
 @wp.func
 def add_filter(sums: Any, p: FilterParams):
-    """Add the gradient w.r.t. the constants of the command filter to a world's parameter gradient."""
+    """Add the gradient w.r.t. the constants of the command filter to a world's parameter gradient.
+
+    From FILTER_GRADIENT on, the rows are in the order of `load_filter`: four rows each of lateral, transversal and sum
+    (`add_limits`), then horizon and speed floor.
+    """
     add_limits(sums, FILTER_GRADIENT, p.lateral)
     add_limits(sums, FILTER_GRADIENT + 4, p.transversal)
     add_limits(sums, FILTER_GRADIENT + 8, p.sum)
