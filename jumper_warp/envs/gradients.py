@@ -108,10 +108,19 @@ class EnvGradients:
         self.read_parameters()
 
     def _column_indices(self) -> dict[str, torch.Tensor]:
-        """Return, for each component of the policy's observation, its column, and for each earlier frame two columns.
+        """Return columns and settings of the policy's observation, by component and by earlier value, as int64.
 
-        newest: column of a component's newest frame; scale, clip: indices of these in the task's numbers; delayed: 1
-        where the sensor's latency applies; older, source: column of an earlier frame, and of the frame after it.
+        A term has adjacent columns: all components of its oldest frame, and so on to its newest. Entries by component,
+        (components,), in the order of the terms:
+
+        newest: column of the component's newest frame.
+        scale, clip: index of the scale [1 / unit of the term], and of the limit [unit of the term], in `params.values`.
+        delayed: 1 where the sensor's latency applies, else 0.
+
+        Entries by value of an earlier frame, (columns - components,):
+
+        older: column of the value.
+        source: column of the same component one frame later, from which the value moves to `older` in a step.
         """
         layout = self.task.layout("actor")
         columns: dict[str, list[int]] = {name: [] for name in ("newest", "scale", "clip", "delayed", "older", "source")}

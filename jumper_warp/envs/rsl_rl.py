@@ -30,7 +30,7 @@ class RslRlVecEnv(RslRlEnv):
     cfg: EnvConfig
 
     def __init__(self, env: VecEnv, metrics_every: int = 24, max_episode_length: int = 1200) -> None:
-        """Adapt `env` to rsl-rl; unless it was reset, call `reset` of the adapter before training.
+        """Adapt `env` to rsl-rl; if `env` was not reset yet, call `reset` of the adapter before training.
 
         metrics_every: policy steps between two reads of the metrics, which wait for the device; with the number of
             steps per iteration they are logged once per iteration. max_episode_length: policy steps; only reported.
@@ -91,7 +91,8 @@ class RslRlVecEnv(RslRlEnv):
 
         actions: (num_envs, num_actions). Observations of ended episodes are those of the new one. extras: `time_outs`
         (num_envs,), 1 where the episode ended without failure, and every `metrics_every` steps `log`, the metrics by
-        name. Raises InputError as `Env.step`.
+        name. Rewards are finite: NaN or infinity counts as 0. `VecEnv` guarantees finite observations, but not finite
+        rewards. Raises InputError as `Env.step`.
         """
         env = self.env
         env.step(actions)

@@ -154,7 +154,11 @@ class Stages(Uncopied):
         self._events(part, AT_STEP, self._all)
 
     def _advance_physics(self, part: WorldSlice) -> None:
-        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions.
+
+        `bodies=False`: SolverJumper does not write passive joints, and poses and velocities of bodies, since no stage
+        reads them. `Simulation.write_bodies` computes them.
+        """
         delays = self.delays
         self.sim.advance(
             self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,

@@ -289,7 +289,8 @@ class Farthest(Suite):
     after the landing. Therefore three reliable distances are reported, the largest middle of a bin up to which at least
     95 % of the jumps succeed: by any means; without a second hop (all paws off the ground again for more than 0.05 s);
     without lifting a paw again (for 0.05 s). For each, the bin's mean distance flown by the base, and mean distance
-    from paws to paws, are reported too. Published distances are those of real robots.
+    from paws to paws, are reported too. `measure` writes the plot `max_jump.png`. It shows distances published for real
+    robots too. `Suite` explains `paper`, `summary` and `run_landings`.
     """
 
     num_jumps: int = 100

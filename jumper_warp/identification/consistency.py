@@ -135,8 +135,11 @@ def parameter_tests(
 def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
     """Return the sensors whose data contradict the fitted parameters, those of motions on the ground first.
 
-    Only their contacts make local minima. Of each kind, the sensor that contradicts the others most is first. normal:
-    normal equations at the fit.
+    The search tries to leave the fit's minimum by dropping a sensor. It tries those on the ground first, since wrong
+    local minima come from contacts, which motions with a fixed base do not have. Of each kind, the sensor with the
+    largest χ² over its limit is first. Deviations are not divided by the mismatch, unlike in the reported tests. This
+    test is therefore stricter: a false alarm only costs a further start, while a missed contradiction may leave the fit
+    in a wrong minimum. normal: normal equations at the fit.
     """
     failed = [(sensor, test) for sensor, test in parameter_tests(problem, normal) if not test.passed]
     failed.sort(key=lambda pair: (not pair[0].motion.free, pair[1].limit / pair[1].chi2))

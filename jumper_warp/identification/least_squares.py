@@ -52,16 +52,16 @@ class NormalEquations:
     """Normal equations of the least-squares problem at one iterate.
 
     Initial states of different motions are coupled only through the parameters. Gradients and matrices are those of
-    half the cost. P parameters; each motion has I coordinates and m residuals.
+    half the cost. Gradients include the priors. P parameters; each motion has I coordinates and m residuals.
     """
 
     cost: float  # sum of squares (robust: of losses) of residuals, prior measurements and priors
     data_cost: float  # part of the cost from the residuals alone
-    gradient: np.ndarray  # (P,) by the parameters
-    matrix: np.ndarray  # (P, P) Gauss-Newton matrix of the parameters, without the prior's identity
-    start_gradients: list[np.ndarray]  # by motion: (I,) by its initial state
+    gradient: np.ndarray  # (P,) by the parameters, with prior measurements and priors
+    matrix: np.ndarray  # (P, P) Gauss-Newton, with prior measurements, without the priors' identity
+    start_gradients: list[np.ndarray]  # by motion: (I,) by its initial state, with its prior
     start_matrices: list[np.ndarray]  # by motion: (I, I) of its initial state, with the prior's identity
-    cross_matrices: list[np.ndarray]  # by motion: (P, I) of the parameters and its initial state
+    cross_matrices: list[np.ndarray]  # by motion: (P, I) of the parameters and its initial state; priors add nothing
     linearised: list[Linearised]  # by motion: residuals and Jacobian
     weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 

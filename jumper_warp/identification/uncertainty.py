@@ -96,7 +96,7 @@ def autocorrelation(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covariance: np.ndarray) -> np.ndarray:
-    """Return the parameters' standard deviations (P,) from contradictions between channels and between motions.
+    """Return the standard deviations (P,) of normalised parameters from contradictions of channels and of motions.
 
     An error of the model repeats in each row, so the clusters are each channel of each motion (such as a motor's
     angle), and each motion. The changes by leaving one cluster out, to first order, give the jackknife's estimate
@@ -104,7 +104,7 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
     channels of a motion.
 
     columns: by motion, the measurement column (such as a motor's angle) of each residual, (m,). covariance: (P, P), of
-    normalised parameters.
+    normalised parameters, with the priors: its inverse is `NormalEquations.information` plus the identity matrix.
     """
     size = len(covariance)
     information = np.linalg.inv(covariance)
@@ -113,6 +113,7 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
     parts = zip(normal.linearised, normal.weights, normal.start_matrices, normal.cross_matrices, columns, strict=True)
     for linear, weight, start_matrix, cross, column in parts:
         root = np.sqrt(weight)
+        # (m, P) derivatives by the parameters while the motion's best initial state follows them (marginalised)
         marginal = linear.jacobian[:, :size] - linear.jacobian[:, size:] @ np.linalg.solve(start_matrix, cross.T)
         jacobian = root[:, None] * marginal
         residual = root * linear.residual

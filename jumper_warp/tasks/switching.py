@@ -49,7 +49,10 @@ def for_switching(task: TaskCfg, randomization: RandomizationCfg) -> TaskCfg:
 def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[list[TaskCfg], list[Handover]]:
     """Return the tasks [walking, *jumps] of one robot, and the rules (`Handover`) that switch to each jump and back.
 
-    All have the randomisation of the last jump: walking was trained with wider ranges of everything but friction.
+    One robot has one set of parameters, so that all tasks have the same ranges: those of the last jump or, without
+    jumps, of walking. The ranges of a jump suit walking too: except for friction, the default ranges for walking
+    (`RandomizationCfg.walking`) are at least as wide as the default ranges for jumping. `resample_at="reset"`:
+    parameters other than pushes are sampled at every reset, not once at startup; a handover is no reset.
     Raises InputError: `walking` is no velocity task, or a jump no jump task.
     """
     for task, state in ((walking, VelocityState), *((jump, JumpState) for jump in jumps)):

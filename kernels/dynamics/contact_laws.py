@@ -29,8 +29,8 @@ class PawLaw:
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
     mu: real  # friction coefficient
-    by_velocity: mat33  # dR/dv^T, 0 where separated
-    by_impulse: mat33  # dR/dp at fixed velocity, 0 where separated
+    by_velocity: mat33  # dR/dv, a row per component of R; 0 where separated
+    by_impulse: mat33  # dR/dp at fixed velocity, a row per component of R; 0 where separated (dR/dp is 1 there)
 
 
 @wp.func

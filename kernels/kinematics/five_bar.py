@@ -71,10 +71,12 @@ def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
     """Return the plane vector x with given projections on two unit vectors: a.x = along_a and b.x = along_b.
 
     With a and b along the shanks, x is the ankle's velocity: a rigid shank moves equally fast along itself at both
-    ends, so that the knees' velocities give both projections.
+    ends, so that the knees' velocities give both projections. If the vectors are parallel to within 1e-4 rad, x is
+    finite, but does not have these projections.
     """
     det = a[0] * b[1] - a[1] * b[0]
-    # the shanks are parallel only where the knees coincide: keep the division finite there
+    # det is the sine of the angle between the shanks. It is 0 where the ankle and both knees lie on a line: the loop is
+    # stretched, or folded (shanks of equal length: the knees coincide). A size of at least 1e-4 keeps x finite
     if wp.abs(det) < real(1.0e-4):
         det = wp.where(det < real(0.0), real(-1.0e-4), real(1.0e-4))
     return vec2(along_a * b[1] - along_b * a[1], along_b * a[0] - along_a * b[0]) / det

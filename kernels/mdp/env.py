@@ -20,11 +20,15 @@ RING = wp.constant(8)
 
 @wp.struct
 class Scene:
-    """Scene that all worlds share: leg geometry, ground and default pose."""
+    """Scene that all worlds share: leg geometry, ground and default pose.
 
-    geometry: wp.array(dtype=LegGeometry)  # (4 robots,), see `leg_of`
+    `reference_q` holds COORDS (43) numbers for each world: position of the base's origin [m], its orientation (xyzw,
+    body to world), five joint angles of each leg [rad], and a quaternion of each leg's loop joint; see `layout`.
+    """
+
+    geometry: wp.array(dtype=LegGeometry)  # (4 num_robots,) FL, FR, BL, BR of each described robot; see `leg_of`
     ground: Ground
-    reference_q: wp.array(dtype=float)  # [m], [1], [rad] joint_q of the default pose, all worlds
+    reference_q: wp.array(dtype=float)  # (COORDS num_worlds,) default pose in the layout of `joint_q`, world by world
 
 
 @wp.struct

@@ -78,7 +78,17 @@ def restore_task_kernel(
 
 
 def make_handover_kernel(handover: Any) -> wp.Kernel:
-    """Return the kernel that performs a `jumper_warp.tasks.cfg.Handover` in the worlds in which its condition holds."""
+    """Return the kernel that performs a `jumper_warp.tasks.cfg.Handover` in the worlds in which its condition holds.
+
+    The handover's functions are `@wp.func` of one world, with robot a `RobotView`:
+
+    - when(robot, state of the source, requested) -> bool: whether to hand over in this step. requested: whether
+      `Env.request` has requested the target task in this world.
+    - begin(robot, state of the source) -> state of the target: initial state, without the requested command.
+    - target.command.set(robot, scene, state of the target, values, heading) -> state of the target: state with the
+      requested command, called after `begin` if the request has one. values: wp.vec4, in the units of the task.
+      heading: yaw of the robot [rad], world.
+    """
     when, begin, set_command = handover.when, handover.begin, handover.target.command.set
 
     name = kernel_name("handover_kernel", handover.source.state, handover.target.state)

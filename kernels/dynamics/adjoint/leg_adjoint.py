@@ -142,14 +142,22 @@ def any_leg(flag: bool) -> bool:
 
 
 @wp.func
-def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
+def law_block(c: PawContact, law: PawLaw, leg: int, j: int) -> mat33:
     """Return the 3x3 block (paw `leg`, paw j) of the matrix from which the contact-law multipliers are solved.
 
-    The matrix is A^T of `step_adjoint`. All arguments except j belong to the leg of this thread. sent, sent_law: c and
-    law again; thread j sends its values to the other threads.
+    The matrix is A^T of `step_adjoint`. With R_k the contact law of paw k and p_k its impulse, its blocks are
+
+        (k, k): W_kk (dR_k/dv_k)^T + (dR_k/dp_k)^T,    (k, j): W_kj (dR_j/dv_j)^T for j != k.
+
+    W_kj is the change of contact velocity v_k per impulse on paw j. It is `total` of paw k for k = j, else
+    G_k S^-1 G_j^T (see `contact`): G_k is `from_lin`, `from_ang` of paw k, and S^-1 G_j^T is `to_lin`, `to_ang` of paw
+    j. A's block (j, k) has W_jk; transposing A gives W_jk^T, which is W_kj since the mass matrix is symmetric. A
+    separated paw has R = p, so that its diagonal block is the identity and its row is 0 elsewhere.
+
+    c, law: contact and linearised law of this thread's paw `leg`. j: same in all threads; thread j sends its part.
     """
-    to_lin = mat_from_leg(sent.to_lin * wp.transpose(sent_law.by_velocity), j)
-    to_ang = mat_from_leg(sent.to_ang * wp.transpose(sent_law.by_velocity), j)
+    to_lin = mat_from_leg(c.to_lin * wp.transpose(law.by_velocity), j)
+    to_ang = mat_from_leg(c.to_ang * wp.transpose(law.by_velocity), j)
     if law.mode == SEPARATE:
         return wp.where(leg == j, wp.identity(n=3, dtype=real), mat33(real(0.0)))
     if leg == j:
@@ -177,10 +185,10 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
     """
     eye = wp.identity(n=3, dtype=real)
     none = mat33(real(0.0))
-    a0 = law_block(c, law, c, law, leg, 0)
-    a1 = law_block(c, law, c, law, leg, 1)
-    a2 = law_block(c, law, c, law, leg, 2)
-    a3 = law_block(c, law, c, law, leg, 3)
+    a0 = law_block(c, law, leg, 0)
+    a1 = law_block(c, law, leg, 1)
+    a2 = law_block(c, law, leg, 2)
+    a3 = law_block(c, law, leg, 3)
     scale = wp.inverse(wp.where(leg == 0, a0, eye))
     a1 = reduce_block(a1, a0, scale * a1, 0, leg)
     a2 = reduce_block(a2, a0, scale * a2, 0, leg)
@@ -246,13 +254,17 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Adjoint multipliers of a step's motion equations and contact laws, and gradients w.r.t. its start velocities."""
+    """Adjoint multipliers of a step's motion equations and contact laws, and part of its start velocities' gradients.
 
-    base: BaseWeights
-    leg: LegWeights
-    lin: vec3  # w.r.t. the base's linear velocity, body axes
-    ang: vec3  # w.r.t. its angular velocity
-    rates: vec3  # w.r.t. the motors' rates
+    `lin`, `ang`, `rates` are M m of `step_adjoint`: the part of these gradients at constant forces. `reverse_leg` adds
+    the derivative of the virtual power, which completes them. Body axes at the start of the step.
+    """
+
+    base: BaseWeights  # of the base's equations of motion; `find_weights` leaves `cotangent` at 0
+    leg: LegWeights  # of this thread's leg and its paw's contact law
+    lin: vec3  # w.r.t. the base's linear velocity
+    ang: vec3  # w.r.t. the base's angular velocity
+    rates: vec3  # w.r.t. the rates of the leg's motors
 
 
 @wp.func

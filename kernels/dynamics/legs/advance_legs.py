@@ -50,17 +50,20 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegState:
-    """State of a thread (leg) between physics steps: motors (lateral, outer, inner), contact, copy of the base."""
+    """State of a thread (leg) between physics steps: motors (lateral, outer, inner), contact, copy of the base.
+
+    `peak_sq`, `total_sq`, `residual` and `rounds` are the largest values over the completed steps of this launch.
+    """
 
     base: BaseState
     angles: vec3  # [rad] of its leg's motors
     rates: vec3  # [rad/s]
     torque: vec3  # [N m] of its motors in the last step
     impulse: vec3  # [N s] on its paw in the last step, world axes
-    peak_sq: real  # [N^2 s^2] largest impulse on the paw, squared
-    total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
-    residual: real  # [m/s] largest of the contact iteration
-    rounds: int  # largest number of rounds of the contact iteration in a step
+    peak_sq: real  # [N^2 s^2] square of the impulse on this leg's paw in a step
+    total_sq: real  # [N^2 s^2] square of the sum of the impulses on the world's four paws in a step
+    residual: real  # [m/s] of the contact iteration in a step, see `PawSolution`
+    rounds: int  # of the contact iteration in a step
     step: int  # steps completed in this launch
     sets: int  # sets of pressed stops tried for the present step and rejected
     pressed: int  # the leg's set of pressed stops in the last completed step or for the next attempt, see `stops`

@@ -22,17 +22,17 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """Inputs and results of one leg in the solution of a physics step; motors are lateral, outer, inner."""
+    """Inputs and results of one leg in the solution of a physics step (`solve_step`); motors: lateral, outer, inner."""
 
-    angles: vec3  # [rad] at the start of the step
-    rates: vec3  # [rad/s] at the start of the step
-    torque: vec3  # [N m] of the motors
-    new_rates: vec3  # [rad/s] at the end of the step
-    stop_rates: stops.StopRates
-    pressed: int  # set of pressed hard stops, see `stops`
-    solve: LegSolve
-    paw: PawKinematics
-    peak_sq: real  # [N^2 s^2] square of the largest impulse on the paw, over the steps of a launch
+    angles: vec3  # in: [rad] at the start of the step
+    rates: vec3  # in: [rad/s] at the start of the step
+    torque: vec3  # in: [N m] of the motors
+    new_rates: vec3  # out: [rad/s] at the end of the step
+    stop_rates: stops.StopRates  # out: motor rates [rad/s] beyond which hard stops press, and damping [N m s/rad]
+    pressed: int  # in, out: set of pressed hard stops in the preceding step, and in this step; see `stops`
+    solve: LegSolve  # out: motor accelerations as a function of the base's acceleration, stops included
+    paw: PawKinematics  # out: position [m] and Jacobians [m/rad] of the paw's centre at `angles`, body axes
+    peak_sq: real  # not of `solve_step`: [N^2 s^2] square of the largest impulse on the paw, over the steps of a launch
 
 
 @wp.struct
