@@ -24,7 +24,7 @@ from jumper_warp.utils.output import output_dir
 from support.scripts import OutputArgs, report, run_script
 
 mujoco: Any = import_module("mujoco")
-RATE, SUBSTEPS, START = 60, 8, 30  # [Hz] Policy steps, physics steps in each, policy step of the command
+START, SETTLED = 0.5, 2.0  # [s] Time of the command, and from which velocities are averaged
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,19 @@ def main(args: Args) -> dict:
     folder = output_dir("mujoco_policy", args.out)
     policy = DeployedPolicy(find_policy(args.policy) / "policy.onnx")
     model, data = make_robot(policy, args.gravity)
-    paws = {model.geom(f"{leg}_paw").id for leg in ("FL", "FR", "BL", "BR")}
+    paws = {model.geom(f"{name[:2]}_paw").id for name in JOINTS}
+    policy_dt = policy.interface["policy_dt"]
+    substeps = round(policy_dt / model.opt.timestep)
+    start = round(START / policy_dt)
     jump = JumpCommand()
     heights = []
     velocities = []
-    for step in range(round(args.seconds * RATE)):
+    for step in range(round(args.seconds / policy_dt)):
         base = Rotation.from_quat(np.roll(data.qpos[3:7], -1))  # MuJoCo has the order wxyz
         yaw = Rotation.from_euler("z", base.as_euler("ZYX")[0])
         way = yaw.inv().apply([*(args.goal - data.qpos[:2]), 0.0])[:2]
-        commanded = step >= START
-        if step == START:
+        commanded = step >= start
+        if step == start:
             jump.request()
         values = {
             "height": data.qpos[2], "lin_vel": base.inv().apply(data.qvel[:3]), "ang_vel": data.qvel[3:6],
@@ -79,10 +82,10 @@ def main(args: Args) -> dict:
         }  # fmt: skip
         readings = {name: value for name, value in values.items() if name in policy.layout}
         data.ctrl[: len(JOINTS)] = policy.targets(readings)
-        mujoco.mj_step(model, data, nstep=SUBSTEPS)
+        mujoco.mj_step(model, data, nstep=substeps)
         heights.append(float(data.qpos[2]))
         velocities.append((*base.inv().apply(data.qvel[:3])[:2], data.qvel[5]))
-    mean = np.mean(velocities[2 * RATE :], axis=0)
+    mean = np.mean(velocities[round(SETTLED / policy_dt) :], axis=0)
     metrics = {
         "apex_m": max(heights), "height_at_end_m": heights[-1], "vx_mean_m_s": mean[0], "vy_mean_m_s": mean[1],
         "yaw_rate_mean_rad_s": mean[2],

@@ -3,6 +3,9 @@
 A forward pass is one launch for all worlds (on a CPU one launch for each thread), as is a reverse pass; on a GPU the
 reverse pass is four launches for every few rows (`reverse_legs`). Between the passes only a row of the state every few
 physics steps, motor torques and the paws' impulses are stored; see `jumper_warp.kernels.dynamics.adjoint.step_adjoint`.
+
+`Rollout` is one class, since its methods share its arrays. Its sections: construction; start poses and leg geometry;
+forward and reverse pass (`run`, `backward`); arrays and launches.
 """
 
 from __future__ import annotations
@@ -171,7 +174,7 @@ class Rollout(Uncopied):
         actuation.limits = self.array(np.repeat(filter_constants(command_filter)[:, None], n, axis=1))
         return actuation
 
-    # ------------------------------------------------------------------ the robots' start and geometry
+    # ------------------------------------------------------------------ start poses and leg geometry
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the model's initial standing pose at rest, as coordinates and rates of base and motors.

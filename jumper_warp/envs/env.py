@@ -1,4 +1,8 @@
-"""Reinforcement-learning environment: tasks on a simulation, in one sequence of kernel launches per policy step."""
+"""Reinforcement-learning environment: tasks on a simulation, in one sequence of kernel launches per policy step.
+
+`Env` is the public interface, one class; its base class `Stages` launches the kernels. Sections of `Env`: construction;
+episodes and steps; settings, commands and hand-overs; observed values and saved states.
+"""
 
 from __future__ import annotations
 
@@ -386,7 +390,7 @@ class Env(Stages):
         """Copy values to a float array on the environment's device, for a kernel launch."""
         return wp.array(values, dtype=float, device=self.wp_device)
 
-    # ------------------------------------------------------------------ what the environment shows, and saved states
+    # ------------------------------------------------------------------ observed values and saved states
 
     @locked
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:

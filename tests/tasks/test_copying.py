@@ -1,4 +1,4 @@
-"""Copies and pickles of tasks."""
+"""Copies and pickles of tasks; Python pickles a task when it starts a process with it. Files never contain pickles."""
 
 import copy
 import json
