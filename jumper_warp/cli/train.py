@@ -7,6 +7,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -215,13 +216,15 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """
     recipe, checkpoints, parsed = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
-    from jumper_warp.training import train
     from jumper_warp.utils.runtime import configure_device
 
     cfg = recipe.train
     task = recipe.task
     is_rank_0 = os.environ.get("RANK", "0") == "0"
-    if is_rank_0 and configure_device(cfg.device, cfg.threads).driver is None:
+    with ThreadPoolExecutor(1) as pool:  # CUDA starts while torch is imported
+        device = pool.submit(configure_device, cfg.device, cfg.threads) if is_rank_0 else None
+        from jumper_warp.training import train
+    if device is not None and device.result().driver is None:
         report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, bool(parsed.preset))
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)

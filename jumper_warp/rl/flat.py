@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import nn
+from torch.optim.adam import adam
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.networks import ActorCritic
@@ -78,10 +78,6 @@ class FlatAdam:
         self.step_count = torch.zeros((), device=device)
         self.exp_avg = torch.zeros_like(flat.value)
         self.exp_avg_sq = torch.zeros_like(flat.value)
-        value = nn.Parameter(flat.value)  # shares the memory
-        value.grad = flat.gradient
-        self._adam = torch.optim.Adam([value], lr=self.lr, fused=True, capturable=device.type == "cuda")
-        self._adam.state[value] = {"step": self.step_count, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq}
 
     @property
     def tensors(self) -> tuple[torch.Tensor, ...]:
@@ -90,7 +86,11 @@ class FlatAdam:
 
     def step(self) -> None:
         """Update parameters and moments in place by one step with `FlatParameters.gradient`."""
-        self._adam.step()
+        # an object of `torch.optim.Adam` would import torch's compiler, which takes a second
+        adam(
+            [self.flat.value], [self.flat.gradient], [self.exp_avg], [self.exp_avg_sq], [], [self.step_count],
+            fused=True, amsgrad=False, beta1=0.9, beta2=0.999, lr=self.lr, weight_decay=0.0, eps=1.0e-8, maximize=False,
+        )  # fmt: skip
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:
         """Return copies of Adam's state of each parameter by its index, in the format of `torch.optim.Adam`."""

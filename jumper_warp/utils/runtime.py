@@ -55,7 +55,7 @@ def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
 
 
 def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
-    """Choose the Warp device and the number of CPU threads of a command, and print the device once.
+    """Choose the Warp device and the number of CPU threads of a command, start it, and print the device once.
 
     Returns the device's properties. device: a Warp device (default: the current
     one). threads: CPU threads of simulations, as in `set_threads`. Raises InputError: there is no such device, or the
@@ -64,7 +64,9 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     set_threads(threads)
     init_warp()
     try:
-        return _report_once(device, checked_threads(None))
+        info = _report_once(device, checked_threads(None))
+        _ = wp.get_device(device).context  # creates the device's context
+        return info
     except (ValueError, RuntimeError) as error:
         known = ", ".join(each.alias for each in wp.get_devices())
         raise InputError(f"no device {device!r:.60}; available: {known}") from error
