@@ -23,7 +23,7 @@ FILES = sorted(path for path in FOLDER.parent.rglob("*.toml") if "[arms]" in pat
 
 @pytest.fixture(autouse=True)
 def own_tasks():
-    load_task_module(str(FOLDER / "departure_tasks.py"))
+    return [load_task_module(str(FOLDER / file)) for file in ("departure_tasks.py", "../paper/readings.py")]
 
 
 def trained(file, name):
@@ -35,14 +35,14 @@ def trained(file, name):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_every_arm_changes_the_task_or_the_trainer_and_can_be_saved(file):
+def test_every_arm_changes_the_task_or_the_trainer_and_can_be_saved(file, own_tasks):
     settings = tomllib.loads(file.read_text())
     first = next(iter(settings["arms"]))
     kept = trained(file, first)
     for name in settings["arms"]:
         recipe = trained(file, name)
         task = recipe.task
-        assert task_from_json(json.loads(json.dumps(task_to_json(task)))) == task
+        assert task_from_json(json.loads(json.dumps(task_to_json(task))), own_tasks) == task
         same = replace(task, name=kept.task.name) == kept.task and recipe.train.ppo == kept.train.ppo
         assert same == (name == first), name
     values = {key: tuple(each) if isinstance(each, list) else each for key, each in settings["evaluation"].items()}
