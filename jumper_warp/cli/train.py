@@ -216,12 +216,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """
     recipe, checkpoints, parsed = parse_train(args)
     from jumper_warp.tasks.overlay_ranges import range_words
-    from jumper_warp.utils.runtime import configure_device
+    from jumper_warp.utils.runtime import configure_device, git_commit
 
     cfg = recipe.train
     task = recipe.task
     is_rank_0 = os.environ.get("RANK", "0") == "0"
-    with ThreadPoolExecutor(1) as pool:  # CUDA starts while torch is imported
+    with ThreadPoolExecutor(2) as pool:  # CUDA and git run while torch is imported
+        pool.submit(git_commit)
         device = pool.submit(configure_device, cfg.device, cfg.threads) if is_rank_0 else None
         from jumper_warp.training import train
     if device is not None and device.result().driver is None:
