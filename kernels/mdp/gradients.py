@@ -1,6 +1,7 @@
 """Rewards and observations of a policy step as differentiable functions of the robot's state.
 
-Phase machine, events and contacts are constants of a step: the gradient belongs to the branch of this step.
+Phase machine, events and the set of paws in contact are constants of a step: the gradient belongs to the branch of this
+step. Contact forces are variables.
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 """Termination terms that any task can use, as functions of the robot's state, the task's state and parameters.
 
-A task's state has the number of policy steps of the episode in `steps`. World z is up. The first term of a task's table
-that holds ends the episode.
+A task's state has the number of policy steps of the episode in `steps`. World z is up. `diverged`, or else the first
+term of a task's table that holds, ends the episode.
 """
 
 from typing import Any
