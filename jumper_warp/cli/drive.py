@@ -31,7 +31,7 @@ class DriveCfg:
     """Conditions of the simulation."""
     ground: Literal["flat", "uneven", "waves", "slope", "stairs", "blocks"] = "flat"  # Ground at the start
     port: int = 8080  # Port of the page; the next free one is used if it is taken
-    out: Path | None = None  # Folder for recordings (default: outputs/drive/<time>)
+    out: Path | None = None  # Folder for recordings (default: outputs/drive)
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
