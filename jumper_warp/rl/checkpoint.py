@@ -42,6 +42,13 @@ class Checkpoint(NamedTuple):
         return int(name.removeprefix(SEED)) if name.startswith(SEED) else None
 
 
+def on_cpu(state: Json) -> Json:
+    """Return a copy of nested dicts with copies of their tensors on the CPU."""
+    return {
+        name: on_cpu(value) if isinstance(value, dict) else value.to("cpu", copy=True) for name, value in state.items()
+    }
+
+
 def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_checkpoints: int = 3) -> Path:
     """Save a training's state as the file `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
 

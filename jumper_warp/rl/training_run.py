@@ -7,7 +7,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,14 @@ from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl import distributed, run_folder
 from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
+from jumper_warp.rl.checkpoint import (
+    DECODE_ERRORS,
+    Checkpoint,
+    CheckpointError,
+    on_cpu,
+    one_line_message,
+    save_checkpoint,
+)
 from jumper_warp.rl.clock import TrainingClock, is_last_iteration
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
@@ -26,6 +33,7 @@ from jumper_warp.rl.run_folder import CONFIG, TrainResult
 from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, SEED
 from jumper_warp.rl.stop_request import StopRequest
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import Json
 from jumper_warp.utils.sources import changed_sources
 
 PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
@@ -61,6 +69,7 @@ class TrainingRun:
         self.clock = TrainingClock(cfg)
         self.metrics: dict[str, float] = {}
         self._scores = Scores(cfg.best_metric)
+        self._saving: Future[Path] | None = None  # writes a checkpoint while the training continues
         self.notes: list[str] = []
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         self._is_finite = True  # Whether the weights are finite, else they are not saved
@@ -131,7 +140,7 @@ class TrainingRun:
         self._begin, self._first_iteration = time.perf_counter(), self.iteration + 1
         self._seconds = 0.0
         self._watch = Stopwatch(self.rank.device)
-        with self._open_log() as self.log:
+        with self._open_log() as self.log, ThreadPoolExecutor(1) as self._saver:
             for note in self.notes:
                 self.log.print_line(note)
             self.ended = is_last_iteration(self.iteration, self.cfg, self.clock.is_over_time())
@@ -139,6 +148,7 @@ class TrainingRun:
                 complete = f"the training is complete at iteration {self.iteration}"
                 self.log.print_line(f"{complete}: raise {self.clock.limit(self.iteration)} to continue")
             yield
+            self._finish_saving()
 
     def collect(self) -> None:
         """Enqueue the rollout of an iteration on the device."""
@@ -237,32 +247,46 @@ class TrainingRun:
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, is_last: bool, stop: StopRequest) -> None:
-        """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one.
+        """Save a checkpoint on rank 0 while the training continues; if it is the last one, wait for it.
 
         It also holds the states of the other ranks' environments, so that a resumed training continues identically.
+        Raises CheckpointError: the last one cannot be saved.
         """
         seconds = self.clock.elapsed()
-        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": self.ppo.random_state()}
+        local = {"ppo": on_cpu(self.ppo.state_dict()), "env": self.env.state_dict(), "rng": self.ppo.random_state()}
         others = distributed.other_states(local, self.rank)
         if self.rank.index != 0:
             return
         state = {"iteration": self.iteration, "seconds": seconds, **local, "others": others}
         state["config"] = json.dumps(self.config)
-        folder = self.folder / CHECKPOINTS
-        try:
-            if not (self.folder / CONFIG).is_file():  # the run's folder was deleted
-                self.folder.mkdir(parents=True, exist_ok=True)
-                run_folder.write_config(self.folder, self.config)
-            path = save_checkpoint(folder, state, self._scores.mean(), self.cfg.max_checkpoints)
-        except OSError as error:
-            if is_last:
-                raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
-            self.log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
-            return
+        self._finish_saving()
+        self._saving = self._saver.submit(self._write, state, self._scores.mean())
         self._scores.clear()
-        if is_last and self._is_single:
+        if is_last and (path := self._finish_saving(is_last)) and self._is_single:
             hint = f", continue with: {self.resume_command}"
             self.log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
+
+    def _write(self, state: Json, score: float | None) -> Path:
+        """Write a checkpoint and return its path. Raises OSError as `save_checkpoint`."""
+        if not (self.folder / CONFIG).is_file():  # the run's folder was deleted
+            self.folder.mkdir(parents=True, exist_ok=True)
+            run_folder.write_config(self.folder, self.config)
+        return save_checkpoint(self.folder / CHECKPOINTS, state, score, self.cfg.max_checkpoints)
+
+    def _finish_saving(self, is_last: bool = False) -> Path | None:
+        """Wait until the checkpoint that is being written is complete, and return its path; None if there is none.
+
+        If it failed, print a warning, or raise CheckpointError if it is the last one.
+        """
+        saving, self._saving = self._saving, None
+        try:
+            return saving and saving.result()
+        except OSError as error:
+            message = f"{self.folder / CHECKPOINTS}: checkpoint not saved"
+            if is_last:
+                raise CheckpointError(f"{message}: {error.strerror}") from error
+            self.log.print_line(f"{message}, retried later: {error.strerror}")
+            return None
 
     @property
     def resume_command(self) -> str:
