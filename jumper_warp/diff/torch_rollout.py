@@ -23,7 +23,7 @@ OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable 
 class TorchTrajectory(NamedTuple):
     """Simulated states, torques and impulses over policy steps as PyTorch tensors with gradients.
 
-    T policy steps of S physics steps; do not change in place.
+    T policy steps of S physics steps; K is T by default, see `Trajectory`. Do not change in place.
     """
 
     q: torch.Tensor  # (K + 1, 19, num_worlds) as in `Trajectory`: base origin [m], quaternion xyzw, motor angles [rad]
