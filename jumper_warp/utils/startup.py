@@ -135,15 +135,20 @@ def prepare_imports() -> None:
         return
     sys.meta_path.insert(0, DeferredFinder())
     gc.set_threshold(FIRST_COLLECTION_THRESHOLD)
-    gc.callbacks.append(_at_first_collection)
+    gc.callbacks.append(_after_first_collection)
     atexit.register(gc.freeze)
 
 
-def _at_first_collection(phase: str, info: dict[str, int]) -> None:
-    """Skip the first collection, which would examine all imports, and collect garbage more often from now on.
+def freeze_imports() -> None:
+    """Exclude all present objects from garbage collections, if there was none since `prepare_imports`.
 
-    Arguments: of gc.callbacks.
+    Call it after the imports of a command, before other objects exist.
     """
-    gc.freeze()
+    if _after_first_collection in gc.callbacks:
+        gc.freeze()
+
+
+def _after_first_collection(phase: str, info: dict[str, int]) -> None:
+    """Collect garbage more often after the first collection, since the imports are over; arguments: of gc.callbacks."""
     gc.set_threshold(COLLECTION_THRESHOLD)
-    gc.callbacks.remove(_at_first_collection)
+    gc.callbacks.remove(_after_first_collection)
