@@ -20,7 +20,6 @@ from jumper_warp.registry import TASKS, TaskEntry, find_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import is_out_of_memory
 from jumper_warp.utils.files import parse_json
-from jumper_warp.utils.startup import freeze_imports
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -226,7 +225,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
         pool.submit(git_commit)
         device = pool.submit(configure_device, cfg.device, cfg.threads) if is_rank_0 else None
         from jumper_warp.training import train
-    freeze_imports()
     if device is not None and device.result().driver is None:
         report_cpu_time(cfg, checkpoints[0].state["iteration"] if checkpoints else 0, bool(parsed.preset))
     if is_rank_0 and recipe.randomize and (words := range_words(task, recipe.robot, changed=True)):

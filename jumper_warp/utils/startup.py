@@ -139,15 +139,6 @@ def prepare_imports() -> None:
     atexit.register(gc.freeze)
 
 
-def freeze_imports() -> None:
-    """Exclude all present objects from garbage collections, if there was none since `prepare_imports`.
-
-    Call it after the imports of a command, before other objects exist.
-    """
-    if _after_first_collection in gc.callbacks:
-        gc.freeze()
-
-
 def _after_first_collection(phase: str, info: dict[str, int]) -> None:
     """Collect garbage more often after the first collection, since the imports are over; arguments: of gc.callbacks."""
     gc.set_threshold(COLLECTION_THRESHOLD)
