@@ -3,6 +3,7 @@ import json
 import math
 import os
 import signal
+import threading
 from contextlib import nullcontext
 
 import pytest
@@ -10,7 +11,9 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
+from full_disk import full_disk
 from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.rl import training_run
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, find_checkpoints, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
@@ -55,6 +58,31 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     manifest = json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text())
     assert manifest.keys() == {"iteration_000002.pt", "iteration_000004.pt"}
     assert json.loads(final_state(result)["config"]) == settings
+
+
+def test_training_continues_while_a_checkpoint_is_written(cfg, monkeypatch):
+    continued = threading.Event()
+
+    class LaterTask(PushTask):  # reports the third iteration of 16 steps
+        def step(self, action):
+            super().step(action)
+            if self.steps > 32:
+                continued.set()
+
+    def save(folder, state, *rest):
+        assert continued.wait(60.0)
+        return save_checkpoint(folder, state, *rest)
+
+    monkeypatch.setattr(training_run, "save_checkpoint", save)
+    result = train(cfg, lambda *args: LaterTask(*args, episode_length=16))
+    saved = load_checkpoint(result.folder / CHECKPOINTS / "iteration_000002.pt")
+    assert not equal(saved["ppo"]["model"], final_state(result)["ppo"]["model"])
+
+
+def test_training_warns_of_a_full_disk_and_fails_at_the_last_checkpoint(cfg, capsys):
+    with full_disk(12_000), pytest.raises(CheckpointError, match="not saved: File too large"):
+        train(cfg, make_env)
+    assert capsys.readouterr().err.count("not saved, retried later") == 1
 
 
 def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg):
