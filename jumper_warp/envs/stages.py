@@ -150,7 +150,7 @@ class Stages(Uncopied):
     def _apply_actions(self, part: WorldSlice) -> None:
         """Convert actions to motor targets and wrenches, then run interval events."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
-        self._launch(action_kernel, (4, part.count), inputs)
+        self._launch(action_kernel, (5, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
     def _advance_physics(self, part: WorldSlice) -> None:

@@ -148,16 +148,20 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 finite = False
                 value = float(0.0)
             total += value
-            running = wp.where(begun, value, episode_sum[i, world] + value)
-            episode_sum[i, world] = wp.where(ended, 0.0, running)
-            if ended:
-                counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(running)
         if not wp.isfinite(total):
             total = float(0.0)
         if wp.static(floor is not None):
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
         write_step_result(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
+        running = wp.vector(length=wp.static(max(len(rewards), 1)), dtype=float)
+        totals = wp.vector(length=wp.static(max(len(rewards), 1)), dtype=wp.float64)
+        for i in range(wp.static(len(rewards))):  # loads of all terms, then stores: a GPU waits once
+            value = term_value[wp.static(i), world]
+            value = wp.where(wp.isfinite(value), value, 0.0)
+            running[i] = wp.where(begun, value, episode_sum[i, world] + value)
+        for i in range(wp.static(len(rewards))):
+            episode_sum[wp.static(i), world] = wp.where(ended, 0.0, running[i])
         listed = ended
         if wp.static(due is not None):
             listed = ended or wp.static(due)(state)
@@ -166,6 +170,10 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             if place < episode.listed.shape[0]:  # a stage that is timed alone lists its worlds again
                 episode.listed[place] = world
         if ended:
+            for i in range(wp.static(len(rewards))):
+                totals[i] = counters.term_sum[wp.static(i), world] + wp.float64(running[i])
+            for i in range(wp.static(len(rewards))):
+                counters.term_sum[wp.static(i), world] = totals[i]
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)

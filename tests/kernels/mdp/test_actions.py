@@ -38,7 +38,7 @@ class Commands:
         """Launch the action stage with an action, (n, 12) or (skills, n, 12), and increment the step count."""
         action = array(np.reshape(action, (-1, self.n, 12)))
         inputs = [action, self.settings, self.push, self.robot, self.episodes, self.delays]
-        wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
+        wp.launch(action_kernel, (5, self.n), inputs, device="cpu")
         wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.episodes], device="cpu")
 
     def motor_array(self, name):
