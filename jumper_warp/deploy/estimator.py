@@ -43,7 +43,7 @@ class EstimatorCfg:
     accel_walk: float = 1.0e-3  # [m/s^3/√Hz]
     paw_noise: float = 0.04  # [m/s] Velocity of a paw at rest, per axis
     paw_scale: float = 0.05  # [1] Error of a paw's velocity relative to the base, as a fraction of it
-    slip: float = 0.05  # [m/s] Velocity of a paw beyond which it loses weight
+    slip: float = 0.05  # [m/s] Velocity of a paw at which it has half its weight
     ground: float = 0.01  # [m] Height of the ground below paws in contact; 1000 if unknown, as is `near` then
     near: float = 0.04  # [m] Greatest height of a paw in contact
     start_tilt: float = 0.01  # [rad]
