@@ -156,7 +156,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         states[world] = state
         running = wp.vector(length=wp.static(max(len(rewards), 1)), dtype=float)
         totals = wp.vector(length=wp.static(max(len(rewards), 1)), dtype=wp.float64)
-        for i in range(wp.static(len(rewards))):  # loads of all terms, then stores: a GPU waits once
+        # Loads of all terms, then stores: a GPU waits once. Rewards are loaded again, since registers are full.
+        for i in range(wp.static(len(rewards))):
             value = term_value[wp.static(i), world]
             value = wp.where(wp.isfinite(value), value, 0.0)
             running[i] = wp.where(begun, value, episode_sum[i, world] + value)
