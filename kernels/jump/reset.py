@@ -196,6 +196,7 @@ def reset_jump(
     start.base_height = level.base_height
     start.ranges = ranges
     start.limits = leg_limits(skill.command_filter)
+    start.limits.transversal_upper = wp.max(start.limits.transversal_upper, ranges.transversal_limit)
     start.ground = place_ground(scene.ground, start, settings.grounds, rng)
     start_mode = start_states.write_start(arrays, scene, start, rng)
     vz = arrays.joint_qd[world * DOFS + 2]

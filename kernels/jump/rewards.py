@@ -174,22 +174,6 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 
 @wp.func
-def folded_legs(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Penalty of transversal motors beyond `angle` [rad] in flight: sum of the squares of the excess [rad^2].
-
-    A thigh that stands upright beside the body is close to the stop of the knee.
-    """
-    if state.phase != FLIGHT:
-        return 0.0
-    total = float(0.0)
-    for m in range(12):
-        if m % 3 != 0:
-            excess = wp.max(robot.angle[m] - angle, 0.0)
-            total += excess * excess
-    return total
-
-
-@wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
     """Reward for motor angles near the retracted pose in the 0.3 s after touchdown.
 
@@ -339,6 +323,15 @@ def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang
     if not should_rest(state):
         return 0.0
     return phi(wp.length(robot.lin_vel), std_lin_vel) * phi(wp.length(robot.ang_vel), std_ang_vel)
+
+
+@wp.func
+def settled(robot: RobotView, state: JumpState, first: float, last: float, std: float) -> float:
+    """Reward for a slow base between two times after touchdown, `first` and `last` policy steps: phi of speed [m/s]."""
+    steps = float(state.phase_steps)
+    if state.phase != LANDED or steps < first or steps >= last:
+        return 0.0
+    return phi(wp.length(robot.lin_vel), std)
 
 
 @wp.func

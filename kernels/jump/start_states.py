@@ -65,6 +65,7 @@ class ResetRanges:
     flight_time: wp.vec2  # [1] fraction of the flight's duration
     flight_lateral: float  # half width of lateral angles in flight
     flight_transversal: wp.vec2  # outer and inner angles in flight
+    transversal_limit: float  # largest outer and inner angle, if that of the command filter is smaller
     touchdown_time: wp.vec2  # [s] before landing
     touchdown_behind: wp.vec2  # base behind the projectile, so that the paws are ahead of it
     paw_depth: wp.vec2  # paws below the base before touchdown

@@ -143,7 +143,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
 def leg_limits(params: FilterParams) -> LegLimits:
     """Return the angle limits [rad] of a command filter as `LegLimits` of the inverse kinematics.
 
-    Start states thus lie within the limits that the filter enforces.
+    Start states thus lie within the limits that the filter enforces, unless a task's reset has a wider limit.
     """
     limits = LegLimits()
     limits.lateral_lower = params.lateral.lower

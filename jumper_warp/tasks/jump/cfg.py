@@ -184,6 +184,8 @@ class ResetCfg:
     """[deg] Largest lateral motor angle to either side in in-flight starts."""
     flight_transversal: Pair = (0.0, 90.0)
     """[deg] Outer and inner motor angles in in-flight starts."""
+    transversal_limit: float = 0.0
+    """[deg] Largest outer and inner motor angle of all starts, if that of the command filter is smaller."""
     touchdown_time: Pair = (0.03, 0.15)
     """[s] Time from a touchdown start to the landing."""
     touchdown_behind: Pair = (0.0, 0.0)
@@ -239,7 +241,7 @@ class ResetCfg:
         """Return the ranges of start states as a kernel struct, `ResetRanges`; step_dt: policy step [s]."""
         degrees = (
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
-            "flight_transversal",
+            "flight_transversal", "transversal_limit",
         )  # fmt: skip
         converted = ("start_probability", "balance_by", "command_delay", "long_wait", "next_jump_delay", "ground")
         ranges = filled(ResetRanges(), self, skip=converted, degrees=degrees)

@@ -96,7 +96,7 @@ def horizontal_jump_standing() -> TaskCfg:
     task = standing(horizontal_jump(), 0.5 * SECOND, 0.3, starts)
     settings = replace(
         task.reset.settings, forward_pitch=0.0, takeoff_pitch=(0.0, 0.0), takeoff_ahead=(0.0, 0.2),
-        touchdown_behind=(0.05, 0.12),
+        touchdown_behind=(0.05, 0.12), transversal_limit=130.0,
     )  # fmt: skip
     task = replace(
         task,
@@ -105,10 +105,10 @@ def horizontal_jump_standing() -> TaskCfg:
         rewards=(
             *task.rewards,
             RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10, scale_by_dt=False),
-            RewardTerm(rewards.folded_legs, -200.0, angle=110.0 * DEG),
+            RewardTerm(rewards.settled, 600.0, first=0.9 * SECOND, last=1.1 * SECOND, std=0.12),
         ),
         levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
-        randomization=FRICTION,
+        randomization=replace(FRICTION, latency=(0.0, 20.0), zero_latency_probability=0.1),
         evaluation=PlaceEvaluation(hold=HOLD),
     )
     return task.with_terms(

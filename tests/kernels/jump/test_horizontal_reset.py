@@ -69,6 +69,15 @@ def test_no_state_collides_or_crosses_the_motor_limits_and_few_samples_are_inval
     assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
 
 
+def test_starts_may_exceed_the_filters_limit_up_to_the_resets_own():
+    task = make_task("horizontal-jump-standing")
+    limits = dataclasses.replace(task.command_filter.transversal, upper=110.0)
+    lower = dataclasses.replace(task.command_filter, transversal=limits)
+    env = make_env(N, task=dataclasses.replace(task, command_filter=lower), seed=1)
+    angles = Starts(env, "standing").q[:, MOTOR_COORDS].reshape(-1, 4, 3)[..., 1:] / DEG
+    assert 120.0 < angles.max() <= task.reset.settings.transversal_limit + 0.01
+
+
 @pytest.mark.parametrize("start_mode", START_MODES)
 def test_headings_cover_the_circle_and_attitudes_their_ranges(env, starts, start_mode):
     sample = starts[start_mode]

@@ -132,8 +132,6 @@ STOP = 2.0 * math.sqrt(0.24525 / 9.81)  # [m] way of a pendulum 0.24525 m high f
 CAPTURE = {"pos": (0.0, 0.0, 0.24525), "lin_vel": (2.0, 0.0, -3.0), "paw_pos": np.tile([STOP, 0.0, 0.0], 4)}
 # FL down; FR up for 0.1 s after contact; BL up for 0.02 s after contact; BR without contact yet
 HOP, HOPPED = {"contact": (1.0, 0.0, 0.0, 0.0), "air_time": (0.0, 0.1, 0.02, 0.4)}, {"paws_landed": 0b0111}
-FOLDED = np.zeros(12)
-FOLDED[[0, 1, 5, 8]] = [3.0, 2.2, 2.4, 1.9]  # lateral, outer, inner, inner
 WIDTHS = {"std_variance": 0.04, "std_lateral": 0.2}
 AIR, GROUND, LANDING = 0.0, 35.0 * DEG, 15.0 * DEG  # [rad] offsets of the postures
 WIDTH = {"std": 10.0 * DEG}
@@ -178,7 +176,9 @@ TERMS = [  # (term, numbers, rows (value, robot, episode), phases in which it is
     ("touchdown_tracking", {"std": 0.1}, [  # 0.1 m away
         (E(-1.0) * touches, {"pos": (1.06, -2.08, 0.3)},
          {"phase": L, "touched_down": touches, "goal": (1.0, -2.0, 0.0)}) for touches in (0, 1)]),
-    ("folded_legs", {"angle": 2.0}, [(0.2**2 + 0.4**2, {"angle": FOLDED}, {})], [F]),
+    ("settled", {"first": 54.0, "last": 66.0, "std": 0.1}, [
+        (value, {"lin_vel": (0.06, 0.0, -0.08)}, {"phase_steps": steps})
+        for steps, value in ((53, 0.0), (54, E(-1.0)), (65, E(-1.0)), (66, 0.0))], [L]),
     ("tracking", TRACKING, [(value, robot, {"goal": (1.0, -2.0, 0.0)})
                             for (_, robot), value in zip(ON_WAY, TRACKED, strict=True)], [F, L]),
     ("estimated_tracking", ESTIMATE, [(1.4, FLYING, missed(0.0)), (
