@@ -1,5 +1,7 @@
 """Filter, position control and frames of the runtime against the simulation's, bit for bit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,9 +15,13 @@ from jumper_warp.robot.motors import (
 )
 from jumper_warp.sim.simulation import Simulation, motor_values
 
+AHEAD = horizontal_jump_filter()
 SETTINGS = {
     "vertical_jump": (jumping_motors(18.0, lateral_torque=10.0), vertical_jump_filter()),
-    "horizontal_jump": (jumping_motors(18.0, lateral_torque=12.0), horizontal_jump_filter()),
+    "horizontal_jump": (
+        jumping_motors(18.0, lateral_torque=12.0),
+        replace(AHEAD, transversal=replace(AHEAD.transversal, upper=110.0)),
+    ),
     "walking": (walking_motors(), walking_filter()),
 }
 WORLDS, STEPS = 50, 72  # 3,600 recorded steps of each policy, 10,800 of all

@@ -157,9 +157,9 @@ def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():
 
 
 def test_correct_aim_removes_constant_overshoot():
-    """A policy that observes goals 40 mm too far misses a quarter as far, or less, after the correction alone."""
+    """A policy that observes goals 60 mm too far misses a quarter as far, or less, after the correction alone."""
     policy, cfg = Policy.load("horizontal_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
-    aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
+    aimed, record = finetune(shift_goal_observation(policy, 0.06), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
     assert last["mean_abs_miss_m"]["nominal"] < 0.25 * first["mean_abs_miss_m"]["nominal"]

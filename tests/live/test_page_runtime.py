@@ -22,7 +22,7 @@ if not (PAGE / "node_modules").is_dir() and not os.environ.get("REQUIRE_PAGE"):
     pytest.skip("the page is not built (make page): tests of its runtime are skipped", allow_module_level=True)
 VECTORS = sorted(path.stem for path in (ASSETS / "conformance").glob("*.json"))
 HEIGHTS = [0.625, 0.675, 0.95, 0.975]  # [m] of jumps that hardly amplify rounding
-PLACES = [[0.6, 0.0], [0.8, 0.0], [1.05, 0.0], [1.2, 0.0]]  # [m] ahead and to the left, likewise
+PLACES = [[0.55, 0.0], [0.75, 0.0], [1.0, 0.0], [1.15, 0.0]]  # [m] ahead and to the left, likewise
 
 
 def node(*args):
