@@ -105,11 +105,13 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
         return level
 
     settings = task.reset.settings
+    command_filter = filter_for(task.command_filter, robot)
     if settings is not None:
         walking = {} if not hasattr(settings, "gait") else {"height": "height"}
         settings = of_fields(settings, OF_FIELD | walking)
         if hasattr(settings, "ground"):
-            settings = replace(settings, ground=of_fields(settings.ground))
+            limit = min(settings.transversal_limit, command_filter.transversal.upper)
+            settings = replace(settings, ground=of_fields(settings.ground), transversal_limit=limit)
         if ours.locked:
             settings = on_fixed_paws(settings, ours)
     places = {} if not hasattr(task.evaluation, "goal_x") else {"success_range": "gain"}
@@ -124,7 +126,7 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
         reset=replace(task.reset, settings=settings),
         randomization=of_fields(task.randomization),
         motors=motors_for(task.motors, robot),
-        command_filter=filter_for(task.command_filter, robot),
+        command_filter=command_filter,
         evaluation=of_fields(task.evaluation, OF_FIELD | places | heights),
     )
 

@@ -1,6 +1,7 @@
 """Tasks in the measures of a robot: the Jumper's numbers stay, those of other robots follow from their sizes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -64,3 +65,12 @@ def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only()
     ahead, back, aside, turning = task.levels[0].last_range
     assert min(ahead, back) > 1.0 and max(aside, turning) < 0.01
     assert task.command_filter.lateral.upper == 0.01
+
+
+def test_starts_stay_within_the_stops_of_the_robot():
+    jumper, task = RobotOverlay({}).description, make_task("horizontal-jump-standing")
+    stop = math.radians(120.0)
+    joints = tuple(replace(joint, upper=min(joint.upper, stop)) for joint in jumper.joints)
+    stiff = scaled(task, replace(jumper, joints=joints), jumper_measures(), jumper_measures())
+    assert stiff.reset.settings.transversal_limit == stiff.command_filter.transversal.upper == pytest.approx(120.0)
+    assert task.reset.settings.transversal_limit == 130.0
