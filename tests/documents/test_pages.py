@@ -1,5 +1,6 @@
 """Every snippet of the README, the site and the policies' pages runs or parses."""
 
+import re
 import shlex
 
 import pytest
@@ -32,3 +33,10 @@ def test_commands_below_the_pictures_of_the_readme_parse(monkeypatch):
     assert 6 <= len(commands) <= 9
     for words in commands:
         Commands().check(words)
+
+
+def test_list_of_pages_is_complete():
+    listed = set(re.findall(r"\((\S+)\.html\)", (ROOT / "docs/llms.txt").read_text()))
+    pages = {page.removeprefix("docs/").removesuffix(".md") for page in PAGES if page.count("/") == 2}
+    contents = {f"{folder}/index" for folder in ("tutorials", "howto", "explanation", "reference")}
+    assert listed == pages - contents
