@@ -125,6 +125,8 @@ class Env(Stages):
         self.handovers = tuple(handovers)
         self.robots = robots_of(robot)
         self.overlay = self.robots[0] if self.robots else None
+        if randomize and len({(moves_of(one), *sorted(one.randomization.items())) for one in self.robots}) > 1:
+            raise InputError("robots that worlds take in turn must have the same latency, friction and own ranges")
         self.conditions = (bool(randomize), bool(noise))
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
         own = [with_own_ranges(each, self.overlay) if randomize else each for each in tasks]
@@ -207,7 +209,7 @@ class Env(Stages):
             self._start_over(check_seed(seed))
         self._ends_episodes = self._ends_episodes or worlds is None
         self.compile()  # `evaluation_reset` compiles no reset kernel
-        self._advance_rng(mask)
+        self._advance_rng(self._part(), mask)
         self._reset_worlds(self._part(), mask)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
@@ -341,8 +343,9 @@ class Env(Stages):
         if not self._started:
             load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
-            self._scene.ground.blocks.zero_()
-        self._advance_rng(mask)
+            for world in np.flatnonzero(chosen).tolist():
+                self._scene.ground.blocks[world : world + 1].zero_()
+        self._advance_rng(self._part(), mask)
         self._restore_first_task(self._part(), mask)
         self._randomize(self._part(), mask)
         inputs = [mask, yaws, self._scene, self._settings, self.episodes.skill, self.robot]
@@ -351,7 +354,6 @@ class Env(Stages):
         self._set_commands(mask, 1, values, yaws)
         self._observe(self._part(), after_reset=int(worlds is not None))
         self._clear_results(mask)
-        self.episodes.done.zero_()
         self._restart_gradients()
 
     @locked

@@ -7,6 +7,7 @@ import warp as wp
 
 from jumper_warp.kernels.layout import BODIES, DOFS
 from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.model_parts import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
@@ -35,13 +36,15 @@ def robot_parameters(
     model = sim.model
     n = sim.num_worlds
     device = sim.device
+    robots = RobotValues.nominal(1) if sim.robot is None else sim.robot
+    one_of_each = slice(min(len(sim.descriptions), n))
     robot = RobotParameters()
     for name in MODEL:
         setattr(robot, name, getattr(model, name))
     for name, short in NOMINAL.items():
         array = getattr(model, name)
         count = int(BODIES) if name.startswith("body") else int(DOFS)
-        first_worlds = array.numpy()[: count * min(len(sim.descriptions), n)]  # one of each robot
+        first_worlds = array.numpy()[: count * one_of_each.stop]
         setattr(robot, f"nominal_{short}", wp.array(first_worlds, dtype=array.dtype, device=device))
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
@@ -49,9 +52,8 @@ def robot_parameters(
     robot.motors = sim.motors
     robot.physics_dt = sim.dt
     robot.skill = skill
-    overlay = sim.robot
-    latency = 0 if overlay is None else round(float(overlay.latency[0, 0]) / sim.dt)
-    robot.latency = wp.full(n, latency, dtype=int, device=device)
+    latency = np.round(robots.latency[one_of_each, 0] / sim.dt).astype(np.int32)
+    robot.latency = wp.array(np.resize(latency, n), dtype=int, device=device)
     robot.observation_latency = wp.zeros(n, dtype=int, device=device)
     robot.push = wp.zeros(n, dtype=wp.spatial_vectorf, device=device)
     for name in ("gain_ratio", "speed_ratio"):
@@ -63,13 +65,12 @@ def robot_parameters(
         for task in tasks:
             lateral, transversal = getattr(task.motors.lateral, attribute), getattr(task.motors.transversal, attribute)
             row = np.array(4 * [lateral, transversal, transversal])
-            if overlay is not None:  # speeds of an overlay are absolute [rad/s], gains and saturation are factors
-                value = getattr(overlay, attribute)[0]
+            if sim.robot is not None:  # speeds of an overlay are absolute [rad/s], gains and saturation are factors
+                value = getattr(robots, attribute)[one_of_each]
                 row = value if attribute.endswith("speed") else row * value
-            rows.append(row)
+            rows.append(row.ravel())
         setattr(robot, f"nominal_{name}", wp.array(np.array(rows, dtype=np.float32), dtype=float, device=device))
-    offset = np.zeros(12) if overlay is None else overlay.offset[0]
-    robot.nominal_offset = wp.array(offset, dtype=float, device=device)
+    robot.nominal_offset = wp.array(robots.offset[one_of_each].ravel(), dtype=float, device=device)
     moves = RangeMoves() if moves is None else moves
     robot.motor_friction_move = wp.array(np.array(moves.motor_friction), dtype=float, device=device)
     robot.friction_move = wp.vec2(moves.dynamic_friction, moves.static_friction)

@@ -185,6 +185,7 @@ class Stages(Uncopied):
             )  # fmt: skip
         if ended_before:
             self._launch(set_skill_kernel, part.count, [self._reset_mask, 0, part.episode])
+            self._advance_rng(part, self._reset_mask)
 
     def _reset_done(self, part: WorldSlice) -> None:
         """Switch worlds to another task where due, reset ended episodes (with auto_reset), and observe both again."""
@@ -272,9 +273,9 @@ class Stages(Uncopied):
         for array in (array for skill in self.skills for array in (skill.term_value, skill.episode_sum)):
             wp.to_torch(array).masked_fill_(begun, 0.0)
 
-    def _advance_rng(self, mask: wp.array) -> None:
+    def _advance_rng(self, part: WorldSlice, mask: wp.array) -> None:
         """Increment the step count of masked worlds, so that their next reset draws other random numbers."""
-        self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
+        self._launch(advance_rng_kernel, part.count, [mask, part.episode])
 
     def _observe(self, part: WorldSlice, after_reset: int) -> None:
         """Write observations; after_reset 1: only where an episode, skill or command just began, not `final_obs`."""
@@ -295,9 +296,13 @@ class Stages(Uncopied):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
-        """Set tasks' commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad]."""
-        commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
+        """Set tasks' commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad].
+
+        A gait frequency of 0, the fourth value, becomes the task's.
+        """
         for skill in self.skills:
+            gait = (0.0, 0.0, 0.0, getattr(skill.task.reset.settings, "gait", 0.0))
+            commands = wp.array(np.where(values == 0.0, gait, values), dtype=wp.vec4, device=self.wp_device)
             self._launch(
                 skill.kernels["set_command"], self.num_envs,
                 [skill.index, mask, begins, commands, headings, self._scene, self.robot, self.episodes, skill.states],

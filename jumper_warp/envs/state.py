@@ -31,15 +31,16 @@ SEED = "seed"  # Key of the seed (`purpose_seed`)
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
     """Return the complete state of an environment as CPU tensors by name (waits for the device).
 
-    Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal`, `seed`, and
-    "condition.name" of options. Nominal parameters are saved as a fingerprint only, numbers of terms only if `Env.set`
-    changed them.
+    Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal`, `seed`,
+    `ends_episodes` and "condition.name" of options. Nominal parameters are saved as a fingerprint only, numbers of
+    terms only if `Env.set` changed them.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
         fields = records(array)
         state |= {prefix + name: torch.from_numpy(np.array(fields[name])) for name in fields.dtype.names or ()}
     state |= {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(purpose_seed(env.stream, env.seed))}
+    state["ends_episodes"] = torch.tensor(env._ends_episodes)
     return state | _conditions(env)
 
 
@@ -81,6 +82,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         array.assign(wp.array(fields, dtype=array.dtype, device=env.wp_device))
     for name, tensor in _tensors(env).items():
         tensor.copy_(state[name])
+    env._ends_episodes = bool(state["ends_episodes"])
     for skill in env.skills:
         skill.params.restore()
 

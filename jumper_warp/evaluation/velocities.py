@@ -65,14 +65,10 @@ class VelocityLog(EvaluationLog):
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
     def begin(self, env: Env) -> None:
-        """Reset every robot to the default pose, with its first command and the task's gait frequency.
-
-        The frequency is the fourth value of a command, 0 for tasks without a gait clock.
-        """
+        """Reset every robot to the default pose, with its first command."""
         self.step_dt = env.step_dt
-        gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         self._command = self._slewed(self._command, self.commands[:, 0])
-        env.evaluation_reset(np.concatenate([self._command, gait], axis=1), self.headings)
+        env.evaluation_reset(self._command, self.headings)
         self._start = env.sim.joint_q()[:, :3].copy()
 
     def _slewed(self, last: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
             ends = {}
             for name in ("goal_lower", "goal_upper"):
                 x, y, z = getattr(level, name)
-                ends[name] = (*times((x, y), "gain"), times(z, "apex") if z else z)
+                ends[name] = (*times((x, 0.0 if ours.locked else y), "gain"), times(z, "apex") if z else z)
             return replace(level, **ends)
         if hasattr(level, "first_range"):
             ranges = {}

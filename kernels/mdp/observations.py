@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from .mirror import LEGS, MOTORS, ROTATION, VECTOR, set_mirror
-from .parameters import RobotParameters
+from .parameters import RobotParameters, nominal_column
 from .view import RobotView, vec12
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -111,7 +111,8 @@ def drawn_speed_limits(robot: RobotParameters, world: int) -> vec12:
     """Relative change of the no-load speed of each motor from the active skill's value [1]."""
     change = vec12()
     for m in range(12):
-        change[m] = robot.motors.no_load_speed[m, world] / robot.nominal_no_load[robot.skill[world], m] - 1.0
+        nominal = robot.nominal_no_load[robot.skill[world], nominal_column(robot, world, m)]
+        change[m] = robot.motors.no_load_speed[m, world] / nominal - 1.0
     return change
 
 

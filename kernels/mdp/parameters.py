@@ -43,17 +43,23 @@ class RobotParameters:
     nominal_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] (21 robots,) body axes
     nominal_inv_inertia: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (21 robots,) body axes
     nominal_armature: wp.array(dtype=float)  # [kg m^2] (38 robots,)
-    nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12)
-    nominal_kd: wp.array2d(dtype=float)  # [N m s/rad] (skills, 12)
-    nominal_no_load: wp.array2d(dtype=float)  # [rad/s] (skills, 12) no-load speed
-    nominal_cutoff: wp.array2d(dtype=float)  # [rad/s] (skills, 12) cutoff speed
-    nominal_saturation: wp.array2d(dtype=float)  # [N m] (skills, 12) torque limit
-    nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
+    nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12 robots)
+    nominal_kd: wp.array2d(dtype=float)  # [N m s/rad] (skills, 12 robots)
+    nominal_no_load: wp.array2d(dtype=float)  # [rad/s] (skills, 12 robots) no-load speed
+    nominal_cutoff: wp.array2d(dtype=float)  # [rad/s] (skills, 12 robots) cutoff speed
+    nominal_saturation: wp.array2d(dtype=float)  # [N m] (skills, 12 robots) torque limit
+    nominal_offset: wp.array(dtype=float)  # [rad] (12 robots,) of the position sensors
     zero_latency: float  # [s] latency from action to motor that is sampled with `zero_probability`
     motor_friction_move: wp.array(dtype=float)  # [N m] (12,) added to ranges of motor friction
     friction_move: wp.vec2  # [1] added to ranges of the paws' (dynamic, static) friction
     latency_move: float  # [s] added to ranges of the latency from action to motor
     skill: wp.array(dtype=int)  # (num_worlds,) index of the active skill
+
+
+@wp.func
+def nominal_column(robot: RobotParameters, world: int, m: int) -> int:
+    """Return the column of `nominal_kp` and of other nominal motor constants for motor m of a world's robot."""
+    return (12 * world + m) % robot.nominal_kp.shape[1]
 
 
 @wp.func
@@ -121,8 +127,9 @@ def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: 
 def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
     """Write gains of motor m in a world: the active skill's nominal (kp, kd) times `ratio`."""
     skill = robot.skill[world]
-    robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * ratio[0]
-    robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * ratio[1]
+    column = nominal_column(robot, world, m)
+    robot.motors.kp[m, world] = robot.nominal_kp[skill, column] * ratio[0]
+    robot.motors.kd[m, world] = robot.nominal_kd[skill, column] * ratio[1]
 
 
 @wp.func
@@ -133,8 +140,9 @@ def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2)
     between them.
     """
     skill = robot.skill[world]
-    no_load = robot.nominal_no_load[skill, m] * ratio[0]
-    cutoff = robot.nominal_cutoff[skill, m] * ratio[1]
+    column = nominal_column(robot, world, m)
+    no_load = robot.nominal_no_load[skill, column] * ratio[0]
+    cutoff = robot.nominal_cutoff[skill, column] * ratio[1]
     if ratio[0] != 1.0 or ratio[1] != 1.0:
         cutoff = wp.min(cutoff, 0.95 * no_load)
     robot.motors.no_load_speed[m, world] = no_load
@@ -144,7 +152,8 @@ def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2)
 @wp.func
 def set_torque_limit(robot: RobotParameters, world: int, m: int):
     """Write the torque limit of motor m in a world: the active skill's nominal limit times `torque_ratio`."""
-    robot.motors.saturation[m, world] = robot.nominal_saturation[robot.skill[world], m] * robot.torque_ratio[m, world]
+    nominal = robot.nominal_saturation[robot.skill[world], nominal_column(robot, world, m)]
+    robot.motors.saturation[m, world] = nominal * robot.torque_ratio[m, world]
 
 
 @wp.func
@@ -192,7 +201,8 @@ def speed_limits(
 def joint_offset(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
     """Set each motor's position sensor error to its nominal value plus a random error from lower to upper [rad]."""
     for m in range(rng.lane, 12, rng.lanes):
-        robot.motors.offset[m, rng.world] = robot.nominal_offset[m] + uniform(rng, m, lower, upper)
+        nominal = robot.nominal_offset[nominal_column(robot, rng.world, m)]
+        robot.motors.offset[m, rng.world] = nominal + uniform(rng, m, lower, upper)
 
 
 @wp.func

@@ -90,6 +90,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
                 states[world] = state
                 episode.history_reset[world] = BEGUN
                 episode.diverged[world] = 0
+                episode.bad_action[world] = 0
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
@@ -202,7 +203,7 @@ def advance_rng_kernel(
 
     Without a policy step in between, two resets would otherwise sample the same start.
     """
-    world = wp.tid()
+    world = episode.first + wp.tid()
     if mask[world] != 0.0:
         episode.step_count[world] = episode.step_count[world] + 1
 

@@ -131,6 +131,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     success = wp.static(bool(endings[i].success))
 
         begun = episode.history_reset[world] == BEGUN
+        counted = begun or episode.done[world] == 0.0  # an ended episode that goes on counts once
         ended = termination != NOT_TERMINATED
         total = float(0.0)
         finite = bool(True)
@@ -170,7 +171,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             place = episode.first + wp.atomic_add(episode.num_listed, episode.slice, 1)
             if place < episode.listed.shape[0]:  # a stage that is timed alone lists its worlds again
                 episode.listed[place] = world
-        if ended:
+        if ended and counted:
             for i in range(wp.static(len(rewards))):
                 totals[i] = counters.term_sum[wp.static(i), world] + wp.float64(running[i])
             for i in range(wp.static(len(rewards))):

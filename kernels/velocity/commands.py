@@ -118,7 +118,7 @@ def set_velocity(
 ) -> VelocityState:
     """Return the state with a velocity commanded by the host, which holds until the next command.
 
-    values: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes; gait frequency [Hz], 0: unchanged. The other
+    values: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes; gait frequency [Hz], 0: as before. The other
     arguments are unused.
     """
     new = with_command(state, wp.vec3(values[0], values[1], values[2]))

@@ -82,6 +82,16 @@ def test_an_evaluation_levels_the_ground_and_a_reset_samples_it_again():
     assert blocks_of(env)["exists"].any()
 
 
+def test_an_evaluation_of_some_worlds_keeps_the_ground_of_the_others():
+    env = make_env(N, task=ground_task(), randomize=True)
+    before = blocks_of(env).copy()
+    chosen = np.arange(N) % 2 == 0
+    env.evaluation_reset([1.5, 0.0, 0.0], worlds=chosen)
+    assert before["exists"][chosen].any() and before["exists"][~chosen].any()
+    assert not blocks_of(env)["exists"][chosen].any()
+    np.testing.assert_array_equal(blocks_of(env)[~chosen], before[~chosen])
+
+
 # ---------------------------------------------------------------- evaluations and further jumps
 
 

@@ -241,6 +241,25 @@ def test_an_evaluation_starts_all_worlds_in_the_default_pose(env):
     np.testing.assert_allclose(env.obs[:, 0], goals[:, Z], atol=1e-6)  # the first observation is the commanded height
 
 
+def test_an_ended_episode_of_an_evaluation_counts_once(env):
+    env.reset(seed=0)
+    env.evaluation_reset([0.0, 0.0, 0.8])
+    edit_episodes(env, phase=LANDED, phase_steps=59)
+    for _ in range(4):
+        env.step(REST)
+    assert env.done.all()
+    np.testing.assert_array_equal(env.skills[0].counters.termination_count.numpy().sum(axis=0), 1)
+
+
+def test_resets_by_a_mask_sample_other_starts_each_time():
+    env = Env(TASK, N, device="cpu")
+    mask = env.use_reset_mask()
+    env.reset()
+    mask.fill_(1.0)
+    starts = [env.step(REST).obs["actor"].clone() for _ in range(3)]
+    assert not any((a == b).all(dim=1).any() for a, b in zip(starts[1:], starts[:-1], strict=True))
+
+
 # ---------------------------------------------------------------- reproducibility and solvers
 
 

@@ -120,6 +120,18 @@ def test_an_environment_continues_bitwise_from_a_saved_state(solver):
     assert fresh.metrics() == saved.metrics()
 
 
+def test_a_loaded_evaluation_resets_no_world():
+    saved, fresh = (make_env(N, seed=1, **ALL_ON) for _ in range(2))
+    saved.evaluation_reset([0.0, 0.0, 0.8])
+    edit_episodes(saved, phase=2, phase_steps=58)
+    fresh.load_state_dict(saved.state_dict())
+    for action in random_actions(N, 20):
+        for env in (saved, fresh):
+            env.step(action)
+        np.testing.assert_array_equal(fresh.sim.joint_q(), saved.sim.joint_q())
+    assert saved.done.any()
+
+
 def ground_env(count=N, platform=0.4, block=0.6, **arguments):
     """Return an environment with far goals, whose starts have a platform or a block where there is room."""
     task = make_task("horizontal-jump")

@@ -87,6 +87,24 @@ def test_environment_randomises_around_overlay_and_saves_it():
     assert set(env.parameters.latency.numpy()) <= {1, 2}  # 3 to 5 ms
 
 
+def test_worlds_have_the_motors_of_their_robots_in_turn():
+    task = make_task("vertical-jump")
+    speeds = {"no_load_speed": tuple(12 * [30.0]), "cutoff_speed": tuple(12 * [15.0])}
+    weak = {"kp": tuple(12 * [1.5]), "saturation": tuple(12 * [0.5]), "offset": tuple(12 * [0.1]), **speeds}
+    robots = [RobotOverlay({}), RobotOverlay({**weak, "latency": (0.05,)})]
+    env = Env(task, 4, randomize=False, noise=False, robot=robots, device="cpu")
+    env.reset()
+    assert env.parameters.latency.numpy().tolist() == [0, 24, 0, 24]  # physics steps
+    alone = [Env(task, 1, randomize=False, noise=False, robot=robot, device="cpu") for robot in robots]
+    for one in alone:
+        one.reset()
+    for name in ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset"):
+        expected = np.hstack([getattr(one.sim.motors, name).numpy() for one in alone])
+        np.testing.assert_array_equal(getattr(env.sim.motors, name).numpy(), np.tile(expected, (1, 2)), name)
+    with pytest.raises(InputError, match="same latency"):
+        Env(task, 4, robot=robots, device="cpu")
+
+
 def test_overlay_accepts_the_described_armature_of_a_locked_axis():
     """An armature that differs from the description stays limited."""
     robot = load_overlay("small_direct_drive")

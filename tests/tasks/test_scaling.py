@@ -65,6 +65,8 @@ def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only()
     ahead, back, aside, turning = task.levels[0].last_range
     assert min(ahead, back) > 1.0 and max(aside, turning) < 0.01
     assert task.command_filter.lateral.upper == 0.01
+    for level in make_task("horizontal-jump", load_overlay("small_direct_drive")).levels:
+        assert level.goal_lower[1] == level.goal_upper[1] == 0.0
 
 
 def test_starts_stay_within_the_stops_of_the_robot():

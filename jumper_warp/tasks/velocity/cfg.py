@@ -68,7 +68,10 @@ class CommandCfg:
     resampling_time_range: Pair = (2.0, 6.0)
     """[s] Time from one command to the next; infinity: one command for the whole episode."""
     smallest: float = 0.0
-    """[m/s], [rad/s] Least magnitude of each sampled component of a command other than to stand."""
+    """[m/s], [rad/s] Least magnitude of each sampled component of a command other than to stand.
+
+    At high speeds ahead, the other components are reduced after this limit.
+    """
 
     struct = CommandRanges
     """Type of the kernel struct that `values` returns."""

@@ -224,6 +224,7 @@ def end_episode(probe, error=0.0, other=11.0, counts=1):
 
     error: curriculum error at the end (tolerance 2); counts: whether the curriculum counts the episode.
     """
+    write(probe.episodes.done, slice(None), 0.0)  # of the last episode
     probe.write(value=error - GROWTH, other=other, counts=counts, steps=0)
     probe.step()
 
