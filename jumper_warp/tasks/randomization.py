@@ -191,3 +191,18 @@ def fixed_ranges(
              "static_friction": friction}  # fmt: skip
     ranges = {name: (value, value) for name, value in fixed.items() if value is not None}
     return ranges | ({} if sensor_offset is None else {"joint_offset": (-sensor_offset, sensor_offset)})
+
+
+PAPER = RandomizationCfg(
+    base_mass=(-1.0, 2.0),  # Table V
+    link_mass=(0.8, 1.2),  # Table V
+    com_shift=(-0.03, 0.03),  # Table V
+    gains=(0.6, 1.4),  # Table V; kp and kd alike: R
+    armature=(0.6, 1.4),  # Table V
+    joint_offset=(-2.0, 2.0),  # Table V
+    push_torque=(-3.0, 3.0),  # Table V
+    push_interval=(0.2, 0.5),  # A
+    push_probability=0.25,  # A
+    resample_at="reset",  # A
+)
+"""Values that the paper's jumps and its walk share; sources: see `jumper_warp.tasks.jump.paper`."""

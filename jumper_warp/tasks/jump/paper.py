@@ -8,6 +8,8 @@ the paper prints neither their weights nor their widths. `docs/results/paper.md`
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from jumper_warp.kernels.jump import errors, paper, phase, reset, rewards, terminations
 from jumper_warp.kernels.jump import observations as jump
 from jumper_warp.kernels.jump.state import JumpState
@@ -19,7 +21,7 @@ from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.jump.cfg import JUMP_COMMAND, Level, ResetCfg, StartProbability, cross_levels
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.observations import PAPER_ROBOT
-from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.randomization import PAPER
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 
@@ -134,35 +136,25 @@ VERTICAL_STARTS = ResetCfg(  # kinds: §V-D
     command_delay=0.5,  # A
 )
 
-HORIZONTAL_STARTS = ResetCfg(  # kinds: §V-D
+HORIZONTAL_STARTS = replace(  # kinds: §V-D
+    VERTICAL_STARTS,
     start_probability=StartProbability(
         standing=0.45, default=0.15, in_flight=0.175, touchdown=0.175, after_landing=0.05
     ),  # A
-    balance_by="steps",  # A: of worlds
     base_xy=0.05,  # A
     tilt=5.0,  # A
     forward_pitch=10.0,  # P: slight; R
-    lean=0.0,  # A
-    heading=0.0,  # A
-    front_x=(0.20, 0.22),  # A
-    front_y=(0.15, 0.17),  # A
-    back_x=(0.20, 0.22),  # A
-    back_y=(0.20, 0.22),  # A
-    takeoff_height=(0.40, 0.45),  # A
     takeoff_ahead=(0.0, 0.1),  # A
-    takeoff_pitch=(0.0, 0.0),  # A
     takeoff_angle=(50.0, 75.0),  # A
     highest_apex=1.0,  # R: within the robot's reach
     landing_height=LANDING_HEIGHT,  # A
     flight_time=(0.02, 0.10),  # A
-    flight_lateral=10.0,  # A
     flight_transversal=(40.0, 80.0),  # A
     touchdown_time=(0.03, 0.15),  # A
     touchdown_behind=(0.05, 0.20),  # P: paws slightly forward; R
     paw_depth=(0.30, 0.45),  # R: leg lengths
     landed_height=(0.30, 0.50),  # A
     landed_ahead=(-0.15, 0.10),  # A
-    landed_speed=(0.0, 0.0),  # A
     command_delay=0.0,  # A
     next_jump_delay=(0.0, 0.7),  # A
 )
@@ -184,25 +176,16 @@ HORIZONTAL_LEVELS = cross_levels(  # range Fig. 9, four levels A, their ranges R
     SQUATS,
 )
 
-RANDOMIZATION = RandomizationCfg(
+RANDOMIZATION = replace(
+    PAPER,
     static_friction=(0.9, 1.2),  # Table V
     dynamic_friction=(0.8, 0.9),  # Table V
-    base_mass=(-1.0, 2.0),  # Table V
-    link_mass=(0.8, 1.2),  # Table V
-    com_shift=(-0.03, 0.03),  # Table V
-    gains=(0.6, 1.4),  # Table V; kp and kd alike: R
     no_load_speed=(0.8, 1.2),  # Table V
     cutoff_speed=(0.8, 1.4),  # Table V
     motor_friction=(0.005, 0.04),  # Table V; Coulomb friction [N m]: R, A
-    armature=(0.6, 1.4),  # Table V
-    joint_offset=(-2.0, 2.0),  # Table V
     latency=(0.0, 16.0),  # Table V: of actions only
     push_force=(-5.0, 5.0),  # Table V
-    push_torque=(-3.0, 3.0),  # Table V
-    push_interval=(0.2, 0.5),  # A
-    push_probability=0.25,  # A
     push_in_flight=False,  # A
-    resample_at="reset",  # A
 )
 
 LATERAL = LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0)  # A
@@ -233,21 +216,17 @@ def vertical_jump_paper() -> TaskCfg:
 
 def horizontal_jump_paper() -> TaskCfg:
     """Return the task of the horizontal jump as printed in the paper."""
-    return TaskCfg(
+    return replace(
+        vertical_jump_paper(),
         name="horizontal-jump-paper",
-        state=JumpState,
         advance=Advance(phase.advance_jump, takeoff_speed=0.25),  # A
         reset=Reset(reset.reset_jump, HORIZONTAL_STARTS, parallel=True),
-        command=JUMP_COMMAND,
         curriculum=Curriculum(errors.landing_error, tolerance=0.10, promote_after=5, counts=reset.from_standing),  # A
         rewards=HORIZONTAL_REWARDS,
         terminations=HORIZONTAL_TERMINATIONS,
         observations=ObservationsCfg(actor=HORIZONTAL_OBSERVATION, critic=HORIZONTAL_OBSERVATION),
         levels=HORIZONTAL_LEVELS,
-        motors=jumping_motors(18.0),  # §VI
         command_filter=FilterCfg(LATERAL, TRANSVERSAL, LimitsCfg(0.0, 220.0, 30.0, 30.0), horizon=8.0 / 60.0),  # A
-        action_scale=(15.0, 90.0),  # §III
-        randomization=RANDOMIZATION,
         reward_floor=None,  # A
         evaluation=PlaceEvaluation(),
     )

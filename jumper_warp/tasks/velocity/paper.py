@@ -8,6 +8,8 @@ the paper prints neither their weights nor their widths. `docs/results/paper.md`
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from jumper_warp.kernels.mdp import rewards as mdp_rewards
 from jumper_warp.kernels.mdp import terminations as mdp_terminations
 from jumper_warp.kernels.velocity import observations as velocity
@@ -17,7 +19,7 @@ from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.robot.motors import FilterCfg, LimitsCfg, walking_motors
 from jumper_warp.tasks.cfg import ObservationsCfg, Reset, TaskCfg
 from jumper_warp.tasks.observations import PAPER_ROBOT
-from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.randomization import PAPER
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND
 from jumper_warp.tasks.velocity.cfg import VELOCITY_COMMAND, CommandCfg, VelocityEvaluation, VelocityResetCfg
@@ -80,26 +82,17 @@ COMMANDS = CommandCfg(
     resampling_time_range=(10.0, 15.0),  # A
 )
 
-RANDOMIZATION = RandomizationCfg(
+RANDOMIZATION = replace(
+    PAPER,
     static_friction=(0.8, 0.95),  # Table V
     dynamic_friction=(0.7, 0.8),  # Table V
-    base_mass=(-1.0, 2.0),  # Table V
-    link_mass=(0.8, 1.2),  # Table V
-    com_shift=(-0.03, 0.03),  # Table V
-    gains=(0.6, 1.4),  # Table V; kp and kd alike: R
     no_load_speed=(0.6, 1.2),  # Table V
     cutoff_speed=(0.6, 1.4),  # Table V
     motor_friction=(0.0, 0.04),  # Table V; Coulomb friction [N m]: R, A
-    armature=(0.6, 1.4),  # Table V
-    joint_offset=(-2.0, 2.0),  # Table V
     latency=(0.0, 32.0),  # Table V
     observation_latency=(0.0, 32.0),  # Table V
     push_force=(-10.0, 10.0),  # Table V
-    push_torque=(-3.0, 3.0),  # Table V
-    push_interval=(0.2, 0.5),  # A
-    push_probability=0.25,  # A
     push_in_flight=True,  # A
-    resample_at="reset",  # A
 )
 
 
