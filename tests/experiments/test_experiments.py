@@ -1,5 +1,6 @@
 import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from experiments import (
     gradient_cost,
     leg_springs,
     mujoco_policy,
-    new_reward,
     rescue,
     solver_accuracy,
     teacher,
@@ -26,7 +26,11 @@ from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.log import run_evaluation, within
 from jumper_warp.evaluation.sweeps import HeightSweep
+from jumper_warp.recipe import Recipe
+from jumper_warp.registry import make_task
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
+from jumper_warp.training import train
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, OpenLoopPolicy, still_policy
 from metric_helpers import saved_metrics, values
@@ -42,26 +46,6 @@ def test_scripts_print_help(script, capsys):
     with pytest.raises(SystemExit) as end:
         parse(importlib.import_module(f"experiments.{script}").Args, script, ["--help"])
     assert end.value.code == 0 and "--out PATH" in capsys.readouterr().out
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Folder, metrics and run of a short training with the reward of `new_reward.py`."""
-    folder = tmp_path_factory.mktemp("new_reward")
-    values = new_reward.main(new_reward.Args(num_envs=16, iterations=2, num_steps=48, out=folder, device="cpu"))
-    (run,) = (folder / "logs" / "vertical-jump").iterdir()
-    return folder, values, run
-
-
-# ---------------------------------------------------------------- a new reward
-
-
-def test_new_reward_is_logged_by_name(trained):
-    folder, values, run = trained
-    line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
-    assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
-    assert values["episode_reward_even_load"] > 0.0
-    assert read_values(folder)["iterations"] == 2
 
 
 def test_template_measures_the_landing_error_over_friction(tmp_path):
@@ -143,9 +127,11 @@ def test_scripted_jump_reaches_open_loop_height_and_is_early_before_command(swee
     assert metrics["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
 
 
-def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_path):
+def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(tmp_path):
+    cfg = TrainCfg(num_envs=16, max_iterations=2, log_root=tmp_path / "logs", device="cpu", tensorboard=False)
+    run = train(Recipe(make_task("vertical-jump"), replace(cfg, ppo=PpoCfg(num_steps=48)))).folder
     reported = HeightSweep(
-        policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
+        policy=str(run), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
     ).run()
     saved = read_values(tmp_path)
     assert saved == reported
