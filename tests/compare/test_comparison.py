@@ -161,6 +161,16 @@ def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
     assert (first.improvement, first.verdict) == (1.0, "better")
 
 
+def test_steps_to_a_share_are_limited_to_the_shortest_run(runs):
+    """A short run that never reaches the share is not better than a long run that reaches it late."""
+    for seed in range(1, 6):
+        save_run(runs.parent, "short", seed, [0.1])
+        save_run(runs.parent, "long", seed, [0.1, 0.9])
+    long, short = compared(runs, "long", "short", primary="-steps_to_80_percent").primary
+    np.testing.assert_array_equal(short.values, long.values)
+    assert short.values[0] == find_arms([runs / "short"])[0].members[0].steps * 10
+
+
 def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):
     evaluated = []
     run_episodes = EvaluationRun.run_episodes
