@@ -17,7 +17,7 @@ import numpy as np
 from jumper_warp.policies.catalog import CONFIG, find_policy
 from jumper_warp.rl.metrics_file import METRICS_FILE, logged_line
 from jumper_warp.rl.run_folder import SOURCES, flat_settings
-from jumper_warp.rl.run_names import SEED, seed_folders, split_seed, start_time, title
+from jumper_warp.rl.run_names import FROZEN, SEED, seed_folders, split_seed, start_time, title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_file, read_json
 
@@ -170,15 +170,14 @@ def find_arms(sources: Sequence[str | Path]) -> tuple[Arm, ...]:
 
 
 def of_equal_length(arms: Sequence[Arm]) -> tuple[Arm, ...]:
-    """Return arms whose last logged metrics are those of the last iteration that all runs have.
+    """Return arms whose last logged metrics are those of the last iteration that all runs have, without frozen seeds.
 
     Their `horizon` is this iteration, in the policy steps of the run with the fewest per iteration.
     """
-    logged = [member for arm in arms for member in arm.members if member.log]
+    logged = [each for arm in arms for each in arm.members if each.log and not (each.folder / FROZEN).exists()]
     until = min((member.last["iteration"] for member in logged), default=math.inf)
     horizon = until * min((member.steps for member in logged), default=1)
-    ends = {"until": until, "horizon": horizon}
-    return tuple(Arm(arm.name, tuple(replace(member, **ends) for member in arm.members)) for arm in arms)
+    return tuple(Arm(arm.name, tuple(replace(m, until=until, horizon=horizon) for m in arm.members)) for arm in arms)
 
 
 def _arm(name: str, members: list[Member]) -> Arm:
