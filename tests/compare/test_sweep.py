@@ -4,6 +4,7 @@ import socket
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import pytest
 
@@ -13,6 +14,7 @@ from jumper_warp.compare.arms import find_arms
 from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned
 from jumper_warp.compare.sweep_report import PICTURE
 from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.run_folder import INTERRUPTED
 from jumper_warp.rl.run_names import seed_folders
 from jumper_warp.utils.errors import InputError
 
@@ -157,6 +159,36 @@ def test_pruning_ends_a_trial_below_the_median(tmp_path):
     last = open_study(sweep).get_trials()[-1]
     assert last.state.name == "PRUNED"
     assert list(last.intermediate_values) == [1]
+
+
+@pytest.mark.parametrize(
+    ("name", "choices", "message"),
+    [("ppo.epochs", [-1, 1], "epochs must be"), ("ppo.epochs", ["many", 1], ": invalid flags")],
+)
+def test_a_trial_that_fails_is_pruned_and_the_sweep_continues(tmp_path, capsys, name, choices, message):
+    path = sweep_file(tmp_path, trials=4)
+    head, _, _ = path.read_text().partition("[parameters]")
+    path.write_text(f'{head}[parameters]\n"{name}" = {{ choices = {choices} }}\n')
+    main(["sweep", str(path)])
+    assert set(states(read_sweep(path))) == {"COMPLETE", "PRUNED"}
+    assert message in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("code", "state"), [(INTERRUPTED, "RUNNING"), ("jumper: no finite weights", "PRUNED")])
+def test_a_trial_of_failed_seeds_is_pruned_but_not_an_interrupted_one(tmp_path, monkeypatch, code, state):
+    def end(*_):
+        raise SystemExit(code)
+
+    monkeypatch.setattr("jumper_warp.compare.sweep.train_arm", end)
+    path = sweep_file(tmp_path, trials=1)
+    with pytest.raises(SystemExit) if code == INTERRUPTED else nullcontext():
+        work_on(path)
+    assert states(read_sweep(path)) == [state]
+
+
+def test_a_boolean_choice_is_a_flag_or_its_opposite(tmp_path):
+    arguments = read_sweep(sweep_file(tmp_path)).arguments({"noise": True, "ppo.normalise-value": False}, "run")
+    assert arguments[arguments.index("cpu") + 1 :][:3] == ["--noise", "--ppo.no-normalise-value", "--seeds"]
 
 
 @pytest.mark.parametrize(
