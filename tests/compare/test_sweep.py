@@ -63,6 +63,7 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
     trained = [arm.settings["env.rewards.jump-height.weight"] for arm in arms]
     chosen = [trial.params["env.rewards.jump-height.weight"] for trial in open_study(sweep).get_trials()]
     assert trained == pytest.approx(chosen)
+    assert any(f"--env.rewards.jump-height.weight {value} --ppo.epochs" in page for value in chosen)
 
 
 @pytest.mark.parametrize(
