@@ -14,12 +14,14 @@ from jumper_warp.rl.run_names import CHECKPOINTS, FROZEN, MANIFEST, newest, seed
 from jumper_warp.rl.runner import Observer
 from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.sources import source_checksums
 
 
 def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     """Train the seeds of a recipe and return the run's folder; a run of the same `run_name` is continued.
 
-    observers: see `jumper_warp.training.train`. Raises InputError: that run has other settings.
+    observers: see `jumper_warp.training.train`. Raises InputError: that run has other settings, or a user's file
+    of the task has changed.
     """
     cfg = recipe.train
     runs = (folder for folder in (cfg.log_root / cfg.task).glob("*/") if title(folder) == cfg.run_name)
@@ -33,8 +35,10 @@ def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     folders = [folder for folder in seeds.values() if not (folder / FROZEN).exists()]
     if not folders:
         raise InputError(f"{run}: the training of every seed has failed, see {FROZEN} there: remove it")
-    saved = Member(folders[0]).settings
-    requested = {name: value for name, value in flat_settings(recipe.to_json()).items() if name not in OF_A_SEED}
+    saved, config = Member(folders[0]), recipe.to_json()
+    sources = source_checksums(config["env"])
+    requested = {name: value for name, value in flat_settings(config).items() if name not in OF_A_SEED} | sources
+    saved = saved.settings | saved.config.get("sources", sources)
     if changed := differences([requested, {name: saved.get(name) for name in requested}]):
         raise InputError(f"{run} was trained with another {next(iter(changed))}: remove it, or choose another log root")
     if all(last_metrics(folder).get("iteration", 0) >= cfg.max_iterations for folder in folders):
