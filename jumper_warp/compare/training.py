@@ -24,7 +24,7 @@ def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     of the task has changed.
     """
     cfg = recipe.train
-    runs = (folder for folder in (cfg.log_root / cfg.task).glob("*/") if title(folder) == cfg.run_name)
+    runs = (run for run in (cfg.log_root / cfg.task).glob("*/") if title(run) == (cfg.run_name or "").replace(" ", "-"))
     run = newest(run for run in runs if any(run.glob(f"*/{CHECKPOINTS}/{MANIFEST}")))
     if run is None:
         return train(recipe, observers=observers).folder
@@ -36,9 +36,9 @@ def train_arm(recipe: Recipe, observers: Sequence[Observer] = ()) -> Path:
     if not folders:
         raise InputError(f"{run}: the training of every seed has failed, see {FROZEN} there: remove it")
     saved, config = Member(folders[0]), recipe.to_json()
-    sources = source_checksums(config["env"])
-    requested = {name: value for name, value in flat_settings(config).items() if name not in OF_A_SEED} | sources
-    saved = saved.settings | saved.config.get("sources", sources)
+    requested = {name: value for name, value in flat_settings(config).items() if name not in OF_A_SEED}
+    requested |= source_checksums(config["env"])
+    saved = saved.settings | saved.config.get("sources", {})
     if changed := differences([requested, {name: saved.get(name) for name in requested}]):
         raise InputError(f"{run} was trained with another {next(iter(changed))}: remove it, or choose another log root")
     if all(last_metrics(folder).get("iteration", 0) >= cfg.max_iterations for folder in folders):

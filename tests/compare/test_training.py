@@ -98,6 +98,11 @@ def test_an_arm_whose_file_has_changed_is_refused(tmp_path):
         train_arm(arm)
 
 
+def test_an_arm_with_a_space_in_its_name_is_kept(tmp_path):
+    arm = recipe(tmp_path, "--max-iterations", "1", "--run-name", "two words")
+    assert train_arm(arm) == train_arm(arm)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
