@@ -103,16 +103,13 @@ class Sweep:
     def arguments(self, params: Json, run: str) -> list[str]:
         """Return the arguments of `jumper train` for a trial. run: its name."""
         seeds = ["--seeds", *map(str, self.seeds), "--run-name", run, "--log-root", str(self.folder)]
-        return [self.task, *shlex.split(self.flags), *flags_of(params), *seeds, "--no-tensorboard"]
+        return [self.task, *shlex.split(self.flags), *shlex.split(flags_of(params)), *seeds, "--no-tensorboard"]
 
 
-def flags_of(params: Json) -> list[str]:
-    """Return the flags of a trial's parameters, with their values; false becomes the opposite, as `--ppo.no-fused`."""
-    words = []
-    for name, value in params.items():
-        words.append("--" + (re.sub(r"([^.]+)$", r"no-\1", name) if value is False else name))
-        words += [] if isinstance(value, bool) else shlex.split(str(value))
-    return words
+def flags_of(params: Json) -> str:
+    """Return the flags of a trial's parameters; true becomes the flag alone, false its opposite, `--ppo.no-fused`."""
+    text = " ".join(f"--{name} {value}" for name, value in params.items()) + " "
+    return re.sub(r"(--|\.)([^.\s]+) False ", r"\1no-\2 ", text.replace(" True ", " ")).strip()
 
 
 def open_study(sweep: Sweep, worker: int = 0) -> Any:
@@ -213,7 +210,6 @@ class TrialReport(Observer):
         """Report to a trial of Optuna."""
         self._trial = trial
         self._sweep = sweep
-        self._reported = 0  # Last reported iteration
         self.begun = False
 
     def begin(self, runs: Sequence[TrainingRun]) -> None:
@@ -222,17 +218,15 @@ class TrialReport(Observer):
         runs[0].check_logged("metric", self._sweep.metric)
 
     def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
-        """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
+        """Report the mean of the finite metrics of a logged iteration. Raises TrialPruned: it is below the median."""
         from optuna.exceptions import TrialPruned
 
-        iteration = min(run.iteration for run in runs)
-        metric = self._sweep.metric
-        values = [run.metrics[metric] for run in runs if metric in run.metrics]
-        logged = iteration % runs[0].cfg.log_interval == 0 and len(values) == len(runs)
-        if logged and iteration > self._reported:
-            self._reported = iteration
-            self._trial.report(float(interquartile_mean(np.array(values))), iteration)
+        iteration = max(run.iteration for run in runs)  # that of a frozen seed does not grow
+        if iteration % runs[0].cfg.log_interval == 0:
             self._trial.set_user_attr(ALIVE, time.time())
+            logged = np.array([run.metrics.get(self._sweep.metric, np.nan) for run in runs])
+            if np.isfinite(logged).any():
+                self._trial.report(float(interquartile_mean(logged[np.isfinite(logged)])), iteration)
             if self._trial.should_prune():
                 raise TrialPruned(f"pruned at iteration {iteration}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ def write_sweep_report(sweep: Sweep) -> Path:
     for trial in trials:
         params = map(format_value, trial.params.values())
         rows.append([trial.user_attrs[RUN], trial.state.name.lower(), format_value(trial.value), *params])
-    best = shlex.join(flags_of(trials[0].params)) if trials else ""
+    best = flags_of(trials[0].params) if trials else ""
     parts = [
         f"# Sweep {sweep.name}",
         f"Task `{sweep.task}`, {len(sweep.seeds)} seeds a trial, {len(trials)} trials of {sweep.trials}. "

@@ -5,13 +5,14 @@ import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, TrialReport, open_study, requeue_abandoned
 from jumper_warp.compare.sweep_report import PICTURE
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.run_folder import INTERRUPTED
@@ -173,6 +174,19 @@ def test_a_trial_that_fails_is_pruned_and_the_sweep_continues(tmp_path, capsys, 
     main(["sweep", str(path)])
     assert set(states(read_sweep(path))) == {"COMPLETE", "PRUNED"}
     assert message in capsys.readouterr().out
+
+
+def test_a_frozen_or_undefined_seed_does_not_stop_the_reports(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    trial = open_study(sweep).ask(sweep.distributions())
+    report = TrialReport(trial, sweep)
+    for iteration, values in ((1, (2.0, 4.0)), (2, (2.0, 8.0)), (3, (2.0, float("nan"))), (4, (float("nan"),) * 2)):
+        pairs = zip((1, iteration), values, strict=True)  # the first seed is frozen at iteration 1
+        cfg = SimpleNamespace(log_interval=1)
+        runs = [SimpleNamespace(iteration=i, cfg=cfg, metrics={sweep.metric: value}) for i, value in pairs]
+        report.after_iteration(runs)
+    (saved,) = open_study(sweep).get_trials()
+    assert saved.intermediate_values == {1: 3.0, 2: 5.0, 3: 2.0}
 
 
 @pytest.mark.parametrize(("code", "state"), [(INTERRUPTED, "RUNNING"), ("jumper: no finite weights", "PRUNED")])
