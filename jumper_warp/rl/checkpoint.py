@@ -206,14 +206,14 @@ def best_checkpoint(folder: Path) -> Path:
 def seed_of(run: Path, seed: int | None) -> Path:
     """Return the folder of a seed of a run, by default of the median seed by the score of its best checkpoint.
 
+    A seed without a score counts as the worst.
     Raises CheckpointError: there is no such seed with a checkpoint, or a manifest is unreadable.
     """
     folders = {name: path for name, path in seed_folders(run).items() if any((path / CHECKPOINTS).glob("*.pt"))}
     if seed is None and folders:
         manifests = {path: _read_manifest(path / CHECKPOINTS) for path in folders.values()}
-        scores = {path: manifest[best]["score"] for path, manifest in manifests.items() if (best := _best(manifest))}
-        middle = statistics.median_low(scores.values()) if scores else None
-        return next((path for path, score in scores.items() if score == middle), next(iter(manifests)))
+        scores = {path: each.get(_best(each) or "", {"score": -math.inf})["score"] for path, each in manifests.items()}
+        return next(path for path, score in scores.items() if score == statistics.median_low(scores.values()))
     if seed is None or seed not in folders:
         known = ", ".join(map(str, folders)) or "none"
         raise CheckpointError(f"{run}: no checkpoint of seed {seed}; seeds with checkpoints: {known}")

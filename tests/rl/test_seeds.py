@@ -128,12 +128,12 @@ def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
         assert newest_run(f"{result.folder}:{seed}") == folder
         assert newest_run(f"{cfg.log_root / 'push'}:{seed}") == folder
         assert newest_run(folder) == folder
-    scores = [0.3, 0.9, 0.5]
-    for folder, score in zip(folders.values(), scores, strict=True):
-        path = folder / CHECKPOINTS / MANIFEST
-        manifest = json.loads(path.read_text())
-        path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
-    assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[7]
+    for scores, median in (([0.3, 0.9, 0.5], 7), ([None, 0.9, 0.5], 7), ([None, 0.9, None], 1)):
+        for folder, score in zip(folders.values(), scores, strict=True):
+            path = folder / CHECKPOINTS / MANIFEST
+            manifest = json.loads(path.read_text())
+            path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
+        assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[median]
     with pytest.raises(InputError, match="no checkpoint of seed 3; seeds with checkpoints: 1, 4, 7"):
         newest_run(f"{result.folder}:3")
 
