@@ -54,7 +54,7 @@ def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_c
 
     folder: created if missing. state: tensors, numbers and strings, with the keys iteration, ppo, env, rng and config.
     score: higher is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest
-    checkpoints to keep, at least 1.
+    checkpoints to keep, at least 1. Checkpoints of later iterations are removed: the training was resumed before them.
     Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,8 @@ def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_c
     write_atomically(path, data)
     manifest.pop(path.name, None)  # the order of entries is the order of saving
     manifest[path.name] = {"sha256": digest, "iteration": state["iteration"], "score": score}
-    kept = [*list(manifest)[-max_checkpoints:], _best(manifest)]
+    branch = {name: entry for name, entry in manifest.items() if entry.get("iteration", 0) <= state["iteration"]}
+    kept = [*list(branch)[-max_checkpoints:], _best(branch)]
     removed = [name for name in manifest if name not in kept]
     for name in removed:
         del manifest[name]
