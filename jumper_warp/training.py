@@ -45,7 +45,7 @@ def train(
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
     actor_init = None
     if cfg.init_policy and not checkpoints:
-        actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo)
+        actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo, recipe.robot and recipe.robot.description)
     return runner.train(cfg, partial(make_env, recipe), command, actor_init, checkpoints, observers)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from jumper_warp.policies.catalog import CONFIG, find_policy
 from jumper_warp.rl.metrics_file import METRICS_FILE, logged_line
 from jumper_warp.rl.run_folder import SOURCES, flat_settings
-from jumper_warp.rl.run_names import SEED, seed_folders, split_seed, start_time, title
+from jumper_warp.rl.run_names import FROZEN, SEED, seed_folders, split_seed, start_time, title
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import Json, read_file, read_json
 
@@ -33,6 +33,7 @@ class Member:
 
     folder: Path
     until: float = math.inf  # Last iteration that counts
+    horizon: float = math.inf  # [policy steps of all worlds] Largest result of `steps_to`
 
     @cached_property
     def config(self) -> Json:
@@ -66,6 +67,11 @@ class Member:
         return rows
 
     @property
+    def steps(self) -> int:
+        """Policy steps of all worlds in an iteration."""
+        return self.config["train"]["ppo"]["num_steps"] * self.config["train"]["num_envs"]
+
+    @property
     def last(self) -> dict[str, float]:
         """Last logged metrics by name up to `until`, without undefined ones."""
         values = next((line for line in reversed(self.log) if line["iteration"] <= self.until), {})
@@ -76,17 +82,14 @@ class Member:
 
         It is of the whole log: `until` limits `last` alone.
         """
-        train = self.config["train"]
-        steps = train["ppo"]["num_steps"] * train["num_envs"]
         logged = [line for line in self.log if line.get(metric) is not None]
-        rows = [(steps * line["iteration"], line.get(TIME), line[metric]) for line in logged]
+        rows = [(self.steps * line["iteration"], line.get(TIME), line[metric]) for line in logged]
         return np.array(rows, dtype=float).reshape(-1, 3).T
 
     def steps_to(self, metric: str, share: float) -> float:
-        """Return the policy steps of all worlds until a metric is at least `share`; all steps if it never is."""
+        """Return the policy steps of all worlds until a metric is at least `share`, at most `horizon`."""
         steps, _, values = self.curve(metric)
-        reached = steps[values >= share]
-        return float(reached[0] if len(reached) else steps[-1])
+        return float(min([self.horizon, *steps[values >= share]]))
 
 
 @dataclass(frozen=True)
@@ -124,8 +127,8 @@ class Arm:
     def last(self, metric: str) -> np.ndarray:
         """Return the last logged value of a metric of every seed, (seeds,), without seeds that lack it.
 
-        `steps_to_95_percent`: policy steps of all worlds to 95 % of the metric that selects checkpoints; all steps of a
-        seed that does not reach it.
+        `steps_to_95_percent`: policy steps of all worlds to 95 % of the metric that selects checkpoints; at
+        most the `horizon`, also of a seed that does not reach it.
         """
         if share := STEPS_TO.fullmatch(metric):
             logged = (each for each in self.members if each.curve(self.best_metric).size)
@@ -167,10 +170,14 @@ def find_arms(sources: Sequence[str | Path]) -> tuple[Arm, ...]:
 
 
 def of_equal_length(arms: Sequence[Arm]) -> tuple[Arm, ...]:
-    """Return arms whose last logged metrics are those of the last iteration that all runs have."""
-    ends = [member.last["iteration"] for arm in arms for member in arm.members if member.log]
-    until = min(ends, default=math.inf)
-    return tuple(Arm(arm.name, tuple(replace(member, until=until) for member in arm.members)) for arm in arms)
+    """Return arms whose last logged metrics are those of the last iteration that all runs have, without frozen seeds.
+
+    Their `horizon` is this iteration, in the policy steps of the run with the fewest per iteration.
+    """
+    logged = [each for arm in arms for each in arm.members if each.log and not (each.folder / FROZEN).exists()]
+    until = min((member.last["iteration"] for member in logged), default=math.inf)
+    horizon = until * min((member.steps for member in logged), default=1)
+    return tuple(Arm(arm.name, tuple(replace(m, until=until, horizon=horizon) for m in arm.members)) for arm in arms)
 
 
 def _arm(name: str, members: list[Member]) -> Arm:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.motion import ROBOT_STATES, TERMINATION, set_motion
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
@@ -114,7 +115,7 @@ def running_steps(recording: Recording) -> np.ndarray:
 def reward_terms(recording: Recording, task: TaskCfg) -> dict[str, np.ndarray]:
     """Return the reward terms of a task and their total by name, (frames, worlds); 0 after the end of an episode.
 
-    Raises InputError: the recording has no complete states.
+    The robots are those of the recording's notes, else the Jumper. Raises InputError: it has no complete states.
     """
     if not {TERMINATION, *ROBOT_STATES} <= recording.motion.keys():
         raise InputError("the recording has no complete states; jumper play writes them beside the .rrd file")
@@ -125,7 +126,8 @@ def reward_terms(recording: Recording, task: TaskCfg) -> dict[str, np.ndarray]:
             raise InputError(f"the recorded {name} is not finite")
     frames, worlds = running.shape
     with phase(f"rewards of {task.name}", frames) as advance:
-        env = Env(task, worlds, device="cpu", randomize=False, noise=False, auto_reset=False)
+        robots = [RobotOverlay.from_json(each) for each in recording.notes.get("robots", ())]
+        env = Env(task, worlds, device="cpu", randomize=False, noise=False, auto_reset=False, robot=robots)
         episode = env.stages()["episode"]
         steps = []
         for frame in range(frames):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import socket
 import time
@@ -23,6 +24,7 @@ from jumper_warp.compare.statistics import interquartile_mean
 from jumper_warp.compare.training import train_arm
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.run_folder import INTERRUPTED
 from jumper_warp.rl.run_names import seed_folders
 from jumper_warp.rl.runner import Observer
 from jumper_warp.rl.training_run import TrainingRun
@@ -100,9 +102,14 @@ class Sweep:
 
     def arguments(self, params: Json, run: str) -> list[str]:
         """Return the arguments of `jumper train` for a trial. run: its name."""
-        chosen = [word for name, value in params.items() for word in (f"--{name}", *shlex.split(str(value)))]
         seeds = ["--seeds", *map(str, self.seeds), "--run-name", run, "--log-root", str(self.folder)]
-        return [self.task, *shlex.split(self.flags), *chosen, *seeds, "--no-tensorboard"]
+        return [self.task, *shlex.split(self.flags), *shlex.split(flags_of(params)), *seeds, "--no-tensorboard"]
+
+
+def flags_of(params: Json) -> str:
+    """Return the flags of a trial's parameters; true becomes the flag alone, false its opposite, `--ppo.no-fused`."""
+    text = " ".join(f"--{name} {value}" for name, value in params.items()) + " "
+    return re.sub(r"(--|\.)([^.\s]+) False ", r"\1no-\2 ", text.replace(" True ", " ")).strip()
 
 
 def open_study(sweep: Sweep, worker: int = 0) -> Any:
@@ -194,36 +201,41 @@ def _is_alive(attributes: Json, grace: float) -> bool:
 
 
 class TrialReport(Observer):
-    """Observer that reports the metric of a trial's seeds to the study, and ends a trial below the median."""
+    """Observer that reports the metric of a trial's seeds to the study, and ends a trial below the median.
+
+    begun: whether the training has begun, so that its settings are valid.
+    """
 
     def __init__(self, trial: Any, sweep: Sweep) -> None:
         """Report to a trial of Optuna."""
         self._trial = trial
         self._sweep = sweep
-        self._reported = 0  # Last reported iteration
+        self.begun = False
 
     def begin(self, runs: Sequence[TrainingRun]) -> None:
         """Raise InputError: the trainings do not log the metric."""
+        self.begun = True
         runs[0].check_logged("metric", self._sweep.metric)
 
     def after_iteration(self, runs: Sequence[TrainingRun]) -> None:
-        """Report the metric of each logged iteration. Raises TrialPruned: it is below the median."""
+        """Report the mean of the finite metrics of a logged iteration. Raises TrialPruned: it is below the median."""
         from optuna.exceptions import TrialPruned
 
-        iteration = min(run.iteration for run in runs)
-        metric = self._sweep.metric
-        values = [run.metrics[metric] for run in runs if metric in run.metrics]
-        logged = iteration % runs[0].cfg.log_interval == 0 and len(values) == len(runs)
-        if logged and iteration > self._reported:
-            self._reported = iteration
-            self._trial.report(float(interquartile_mean(np.array(values))), iteration)
+        iteration = max(run.iteration for run in runs)  # that of a frozen seed does not grow
+        if iteration % runs[0].cfg.log_interval == 0:
             self._trial.set_user_attr(ALIVE, time.time())
+            logged = np.array([run.metrics.get(self._sweep.metric, np.nan) for run in runs])
+            if np.isfinite(logged).any():
+                self._trial.report(float(interquartile_mean(logged[np.isfinite(logged)])), iteration)
             if self._trial.should_prune():
-                raise TrialPruned(f"{self._trial.user_attrs[RUN]}: pruned at iteration {iteration}")
+                raise TrialPruned(f"pruned at iteration {iteration}")
 
 
 def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequence[str]], Recipe]) -> None:
-    """Train the seeds of a trial, or continue its run, and save the result in the study."""
+    """Train the seeds of a trial, or continue its run, and save the result in the study.
+
+    A trial whose settings are invalid, or whose training fails, is pruned.
+    """
     from optuna.exceptions import TrialPruned
     from optuna.trial import TrialState
 
@@ -231,14 +243,17 @@ def run_trial(study: Any, trial: Any, sweep: Sweep, recipe_of: Callable[[Sequenc
     trial.set_user_attr(WORKER, f"{socket.gethostname()}:{os.getpid()}")
     trial.set_user_attr(ALIVE, time.time())
     trial.set_user_attr(RUN, run)
+    report = TrialReport(trial, sweep)
     try:
-        folder = train_arm(recipe_of(sweep.arguments(trial.params, run)), [TrialReport(trial, sweep)])
-    except TrialPruned as error:
-        print(error)
+        folder = train_arm(recipe_of(sweep.arguments(trial.params, run)), [report])
+        logged = [last_metrics(each) for each in seed_folders(folder).values()]
+        values = [metrics[sweep.metric] for metrics in logged if metrics.get(sweep.metric) is not None]
+        if not values:
+            raise TrialPruned(f"has not logged {sweep.metric} at its end; it logged {', '.join(logged[0])}")
+    except (TrialPruned, InputError, SystemExit) as error:
+        if error.args == (INTERRUPTED,) or (report.begun and isinstance(error, InputError)):
+            raise
+        print(f"{run}: {'invalid flags' if error.args == (2,) else error}")  # tyro has printed which
         study.tell(trial, state=TrialState.PRUNED)
         return
-    logged = [last_metrics(each) for each in seed_folders(folder).values()]
-    values = [metrics[sweep.metric] for metrics in logged if metrics.get(sweep.metric) is not None]
-    if not values:
-        raise InputError(f"{run} has not logged {sweep.metric} at its end; it logged {', '.join(logged[0])}")
     study.tell(trial, float(interquartile_mean(np.array(values))))

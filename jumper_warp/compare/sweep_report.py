@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.compare.report import table, words
-from jumper_warp.compare.sweep import RUN, Sweep, open_study
+from jumper_warp.compare.sweep import RUN, Sweep, flags_of, open_study
 from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.metrics import format_value
 from jumper_warp.viz.plots import figure
@@ -29,7 +29,7 @@ def write_sweep_report(sweep: Sweep) -> Path:
     for trial in trials:
         params = map(format_value, trial.params.values())
         rows.append([trial.user_attrs[RUN], trial.state.name.lower(), format_value(trial.value), *params])
-    best = " ".join(f"--{name} {format_value(value)}" for name, value in trials[0].params.items()) if trials else ""
+    best = flags_of(trials[0].params) if trials else ""
     parts = [
         f"# Sweep {sweep.name}",
         f"Task `{sweep.task}`, {len(sweep.seeds)} seeds a trial, {len(trials)} trials of {sweep.trials}. "

@@ -213,12 +213,13 @@ class TaskRuntime:
     def metrics(self) -> dict[str, float]:
         """Return the task's metrics by name since the last call, and clear the counters (waits for the device).
 
-        A mean without samples is 0. `Episode_Reward/<term>`: mean over the ended episodes of the term's sum over the
-        episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean sum, of a task without a time limit.
-        `Episode_Termination/<term>`: fraction of the ended episodes. `Metrics/success`: fraction of the episodes that
-        the curriculum counts; `Metrics/error_of_successes_<unit>`: mean curriculum error of the successful ones.
-        `Metrics/bad_actions`: number of policy steps with a non-finite action, over all worlds. Each `StateMetric` of
-        the task adds its `name`. One with `per` also sets its two fields in the task states of all worlds to 0.
+        Without samples, a mean of the group Metrics is NaN, and others are 0. `Episode_Reward/<term>`: mean over the
+        ended episodes of the term's sum over the episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean
+        sum, of a task without a time limit. `Episode_Termination/<term>`: fraction of the ended episodes.
+        `Metrics/success`: fraction of the episodes that the curriculum counts; `Metrics/error_of_successes_<unit>`:
+        mean curriculum error of the successful ones. `Metrics/bad_actions`: number of policy steps with a non-finite
+        action, over all worlds. Each `StateMetric` of the task adds its `name`. One with `per` also sets its two fields
+        in the task states of all worlds to 0.
         """
         task = self.task
         counters = self.counters
@@ -233,9 +234,9 @@ class TaskRuntime:
             metrics[f"Episode_Termination/{term.name}"] = float(count) / ended
         counted = int(counters.curriculum_episodes.numpy().sum())
         succeeded = int(counters.curriculum_successes.numpy().sum())
-        metrics["Metrics/success"] = succeeded / max(counted, 1)
-        error = float(counters.error_sum.numpy().sum())
-        metrics[f"Metrics/error_of_successes_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
+        metrics["Metrics/success"] = succeeded / counted if counted else math.nan
+        error = float(counters.error_sum.numpy().sum()) / succeeded if succeeded else math.nan
+        metrics[f"Metrics/error_of_successes_{task.curriculum.options['unit']}"] = error
         metrics["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()
@@ -253,9 +254,8 @@ class TaskRuntime:
         states = records(self.states).copy()
         for metric in metrics:
             values, per = (_finite(states, field) for field in (metric.field, metric.per or metric.field))
-            total = 0.0 if metric.per is None else float(per.sum())
-            mean = float(values.mean()) if metric.per is None else 0.0
-            values_by_name[metric.name] = float(values.sum()) / total if total else mean
+            total = self.num_envs if metric.per is None else float(per.sum())
+            values_by_name[metric.name] = float(values.sum()) / total if total else math.nan
         for metric in metrics:
             if metric.per is not None:
                 states[metric.field] = states[metric.per] = 0.0

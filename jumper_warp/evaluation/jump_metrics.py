@@ -191,7 +191,7 @@ class LandingFlags(JumpFlags):
 
     def log(self, task: TaskCfg, seed: int) -> JumpLog:
         """Return a new log of one jump per world, with goals and headings from the flags."""
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng((seed, 1))  # headings have the seed itself
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
         return JumpLog(goals[:, None], task.termination_names, headings, self.delay, self.hold)

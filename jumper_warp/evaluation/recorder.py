@@ -47,8 +47,8 @@ class EnvRecorder:
         """Prepare an empty recording of worlds (indices, at least one) of the environment.
 
         log: supplies series, states, commands, labels and goals; ground: as in `build_model`; block: the environment's
-        sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log. live: viewer that
-        shows the frames while they are recorded.
+        sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log and the robots. live:
+        viewer that shows the frames while they are recorded.
         """
         from jumper_warp.robot.model import build_model
         from jumper_warp.viz.recorder import Recorder
@@ -62,7 +62,8 @@ class EnvRecorder:
         robots = [robots[world % len(robots)] for world in worlds] if len(robots) > 1 else robots
         model = build_model(len(worlds), description=robots, ground=ground, device=env.wp_device, mujoco=False)
         labels = log.names(self.worlds)
-        notes = {**(notes or {}), **log.notes(self.worlds)}
+        own = [env.robots[world % len(env.robots)] for world in worlds] if len(env.robots) > 1 else env.robots
+        notes = {"robots": [robot.to_json() for robot in own], **(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)

@@ -379,7 +379,7 @@ def distance_metrics(bins: dict[float, JumpLog]) -> Metrics:
     names = [field.name for field in fields(JumpOutcome)]
     together = JumpOutcome(**{name: np.concatenate([getattr(o, name) for o in outcomes]) for name in names})
     goals = np.concatenate([landings.goals for landings in bins.values()])
-    inside = within(goals[..., 0], IN_RANGE)
+    inside = within(np.linalg.norm(goals, axis=-1), IN_RANGE)
     by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]
     lists: dict[str, list[Any]] = {key: [metrics[key].value for metrics in by_bin] for key in MEANS}
     values = jump_metrics(together) | range_metrics(together, inside, "over 1 to 1.4 m")

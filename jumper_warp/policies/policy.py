@@ -32,6 +32,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
 from jumper_warp.rl.run_names import CHECKPOINTS
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.tasks import saving
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
@@ -398,15 +399,18 @@ def export_onnx(policy: Policy, path: Path) -> Path:
 # ---------------------------------------------------------------------- further training
 
 
-def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
+def actor_init_from_policy(
+    source: str | Path, task: TaskCfg, cfg: PpoCfg, robot: RobotDescription | None = None
+) -> ActorInit:
     """Return the initialisation of a training's actor from the policy `source` (see `Policy.load`).
 
+    robot: of the training, by default the Jumper.
     Observation and joints must agree; action scale, gains, torque limits and time steps may differ.
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
     observation or joints differ from the task's, or an error of `make_actor_init`.
     """
     policy = Policy.load(source)
-    check_interface(policy.interface, interface(task))
+    check_interface(policy.interface, interface(task, robot))
     symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
     return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
 

@@ -54,7 +54,7 @@ def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_c
 
     folder: created if missing. state: tensors, numbers and strings, with the keys iteration, ppo, env, rng and config.
     score: higher is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest
-    checkpoints to keep, at least 1.
+    checkpoints to keep, at least 1. Checkpoints of later iterations are removed: the training was resumed before them.
     Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,8 @@ def save_checkpoint(folder: Path, state: Json, score: float | None = None, max_c
     write_atomically(path, data)
     manifest.pop(path.name, None)  # the order of entries is the order of saving
     manifest[path.name] = {"sha256": digest, "iteration": state["iteration"], "score": score}
-    kept = [*list(manifest)[-max_checkpoints:], _best(manifest)]
+    branch = {name: entry for name, entry in manifest.items() if entry.get("iteration", 0) <= state["iteration"]}
+    kept = [*list(branch)[-max_checkpoints:], _best(branch)]
     removed = [name for name in manifest if name not in kept]
     for name in removed:
         del manifest[name]
@@ -206,14 +207,14 @@ def best_checkpoint(folder: Path) -> Path:
 def seed_of(run: Path, seed: int | None) -> Path:
     """Return the folder of a seed of a run, by default of the median seed by the score of its best checkpoint.
 
+    A seed without a score counts as the worst.
     Raises CheckpointError: there is no such seed with a checkpoint, or a manifest is unreadable.
     """
     folders = {name: path for name, path in seed_folders(run).items() if any((path / CHECKPOINTS).glob("*.pt"))}
     if seed is None and folders:
         manifests = {path: _read_manifest(path / CHECKPOINTS) for path in folders.values()}
-        scores = {path: manifest[best]["score"] for path, manifest in manifests.items() if (best := _best(manifest))}
-        middle = statistics.median_low(scores.values()) if scores else None
-        return next((path for path, score in scores.items() if score == middle), next(iter(manifests)))
+        scores = {path: each.get(_best(each) or "", {"score": -math.inf})["score"] for path, each in manifests.items()}
+        return next(path for path, score in scores.items() if score == statistics.median_low(scores.values()))
     if seed is None or seed not in folders:
         known = ", ".join(map(str, folders)) or "none"
         raise CheckpointError(f"{run}: no checkpoint of seed {seed}; seeds with checkpoints: {known}")

@@ -240,7 +240,7 @@ def _summary(seeds: Sequence[dict[str, float]]) -> str:
         mean = sum(i * part for each in levels for i, part in enumerate(each)) / len(levels)
         level = f"mean level {mean:.1f} of {len(levels[0]) - 1}"
         parts.append(f"{parts.pop()} at {level}" if success else level)
-    return ", ".join(parts)
+    return ", ".join(parts).replace(", success nan %", "")  # without an ended episode
 
 
 def _mean_over(seeds: Sequence[dict[str, float]], name: str, form: str, interval: str) -> str:

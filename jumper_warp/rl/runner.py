@@ -112,7 +112,8 @@ def train(
         if folder is not None:
             results = {run.cfg.seed: run.result() for run in runs}
             hint = f", continue with: {runs[0].resume_command}" if stop.requested else ""
-            console.print_line(f"ended by {runs[0].reason(stop)}, saved in {folder}{hint}")
+            last = min(runs, key=lambda run: bool(run.failure))  # not a frozen one, unless all are
+            console.print_line(f"ended by {last.reason(stop)}, saved in {folder}{hint}")
             for line in seeds_table(results, cfg.best_metric):
                 console.print_line(line)
             result = total_result(folder, results)

@@ -211,8 +211,8 @@ class TrainingRun:
     def reason(self, stop: StopRequest) -> str:
         """Return a text about why the training ends, with the steps made if they are not all."""
         done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
-        steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
-        return f"{'an interruption' if stop.requested else self.clock.limit(self.iteration)}{steps}"
+        end = "an interruption" if stop.requested else "a failure" if self.failure else self.clock.limit(self.iteration)
+        return f"{end} after {done:.2f} M of {total:.2f} M steps" if done < total else end
 
     def _check(self) -> None:
         """Report NaN and infinite terms; set `failure` if one or the weights end the training."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.evaluation.jump_metrics import HeightFlags, HeightPlayFlags, LandingFlags
-from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.evaluation.jumps import JumpLog, random_headings
 from jumper_warp.evaluation.run import write_trials
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.jump.evaluation import TERMINATIONS, with_jump_terminations
@@ -24,6 +24,12 @@ def test_flags_have_the_values_of_the_tasks_evaluation():
     evaluation = make_task("vertical-jump-mars").evaluation
     assert evaluation.default_flags("evaluate") == HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9))
     assert evaluation.default_flags("play") == HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+
+
+def test_goals_to_the_side_and_headings_are_independent():
+    log = LandingFlags(num_jumps=2000, goal_y=(-0.2, 0.1)).log(TASK, seed=3)
+    assert abs(np.corrcoef(log.goals[:, 0, 1], log.headings)[0, 1]) < 0.1
+    np.testing.assert_array_equal(log.headings, random_headings(2000, 3))
 
 
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():

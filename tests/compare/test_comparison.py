@@ -12,6 +12,7 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.run_folder import CONFIG
+from jumper_warp.rl.run_names import FROZEN
 from jumper_warp.utils.errors import InputError
 
 
@@ -159,6 +160,24 @@ def test_the_steps_to_a_share_can_be_the_primary_metric(runs):
     assert tuck.improvement == pytest.approx(0.5)
     first = compared(runs, "base", "tuck", primary="-steps_to_15_percent").primary[1]
     assert (first.improvement, first.verdict) == (1.0, "better")
+
+
+def test_steps_to_a_share_are_limited_to_the_shortest_run(runs):
+    """A short run that never reaches the share is not better than a long run that reaches it late."""
+    for seed in range(1, 6):
+        save_run(runs.parent, "short", seed, [0.1])
+        save_run(runs.parent, "long", seed, [0.1, 0.9])
+    long, short = compared(runs, "long", "short", primary="-steps_to_80_percent").primary
+    np.testing.assert_array_equal(short.values, long.values)
+    assert short.values[0] == find_arms([runs / "short"])[0].members[0].steps * 10
+
+
+def test_a_frozen_seed_does_not_shorten_the_other_runs(runs):
+    frozen = save_run(runs.parent, "base", 6, [0.1])
+    (frozen / FROZEN).write_text("iteration 10: the weights are not finite\n")
+    base, tuck = compared(runs, "base", "tuck").primary
+    np.testing.assert_allclose(base.values, [0.51, 0.52, 0.53, 0.54, 0.55, 0.1])
+    np.testing.assert_allclose(tuck.values, [0.81, 0.82, 0.83, 0.84, 0.85])
 
 
 def test_a_missing_primary_metric_is_refused_after_the_first_seed(monkeypatch):

@@ -10,6 +10,7 @@ from jumper_warp.cli.main import main
 from jumper_warp.compare.rescore import rescore
 from jumper_warp.compare.tasks import base_of, task_of
 from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.utils.errors import InputError
 from recordings import record_jumps
 
@@ -52,6 +53,16 @@ def test_a_new_reward_is_paid_for_the_recorded_states_until_the_episode_ends(rec
     np.testing.assert_allclose(result.terms["height_reward"], expected, rtol=1e-5, atol=1e-6)
     assert not result.running.all()
     assert result.changed == ["total", "height_reward"]
+
+
+def test_the_rewards_are_those_of_the_recorded_robot():
+    paid = []
+    settings = {"robot": load_overlay("small_direct_drive"), "auto_reset": False}
+    pay = lambda env: paid.append(sum(values.numpy() for values in env.reward_terms.values()))  # noqa: E731
+    recorder = record_jumps([0.9], 5, [0], pay, **settings)
+    task = make_task("vertical-jump")
+    result = rescore(recorder.recording(), task, task)
+    np.testing.assert_allclose(result.values("total"), paid, rtol=1e-4)
 
 
 def test_the_table_and_the_lanes_have_the_sums_of_task_and_base(recording, tmp_path):

@@ -4,15 +4,18 @@ import socket
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 
 from jumper_warp.cli.main import main
 from jumper_warp.cli.sweep import GPUS, SweepCfg, read_sweep, submit, work_on
 from jumper_warp.compare.arms import find_arms
-from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, open_study, requeue_abandoned
+from jumper_warp.compare.sweep import ALIVE, RUN, WORKER, TrialReport, open_study, requeue_abandoned
 from jumper_warp.compare.sweep_report import PICTURE
 from jumper_warp.rl.metrics_file import last_metrics
+from jumper_warp.rl.run_folder import INTERRUPTED
 from jumper_warp.rl.run_names import seed_folders
 from jumper_warp.utils.errors import InputError
 
@@ -61,6 +64,7 @@ def test_a_sweep_trains_its_trials_and_a_later_one_continues(tmp_path, capsys, s
     trained = [arm.settings["env.rewards.jump-height.weight"] for arm in arms]
     chosen = [trial.params["env.rewards.jump-height.weight"] for trial in open_study(sweep).get_trials()]
     assert trained == pytest.approx(chosen)
+    assert any(f"--env.rewards.jump-height.weight {value} --ppo.epochs" in page for value in chosen)
 
 
 @pytest.mark.parametrize(
@@ -157,6 +161,49 @@ def test_pruning_ends_a_trial_below_the_median(tmp_path):
     last = open_study(sweep).get_trials()[-1]
     assert last.state.name == "PRUNED"
     assert list(last.intermediate_values) == [1]
+
+
+@pytest.mark.parametrize(
+    ("name", "choices", "message"),
+    [("ppo.epochs", [-1, 1], "epochs must be"), ("ppo.epochs", ["many", 1], ": invalid flags")],
+)
+def test_a_trial_that_fails_is_pruned_and_the_sweep_continues(tmp_path, capsys, name, choices, message):
+    path = sweep_file(tmp_path, trials=4)
+    head, _, _ = path.read_text().partition("[parameters]")
+    path.write_text(f'{head}[parameters]\n"{name}" = {{ choices = {choices} }}\n')
+    main(["sweep", str(path)])
+    assert set(states(read_sweep(path))) == {"COMPLETE", "PRUNED"}
+    assert message in capsys.readouterr().out
+
+
+def test_a_frozen_or_undefined_seed_does_not_stop_the_reports(tmp_path):
+    sweep = read_sweep(sweep_file(tmp_path))
+    trial = open_study(sweep).ask(sweep.distributions())
+    report = TrialReport(trial, sweep)
+    for iteration, values in ((1, (2.0, 4.0)), (2, (2.0, 8.0)), (3, (2.0, float("nan"))), (4, (float("nan"),) * 2)):
+        pairs = zip((1, iteration), values, strict=True)  # the first seed is frozen at iteration 1
+        cfg = SimpleNamespace(log_interval=1)
+        runs = [SimpleNamespace(iteration=i, cfg=cfg, metrics={sweep.metric: value}) for i, value in pairs]
+        report.after_iteration(runs)
+    (saved,) = open_study(sweep).get_trials()
+    assert saved.intermediate_values == {1: 3.0, 2: 5.0, 3: 2.0}
+
+
+@pytest.mark.parametrize(("code", "state"), [(INTERRUPTED, "RUNNING"), ("jumper: no finite weights", "PRUNED")])
+def test_a_trial_of_failed_seeds_is_pruned_but_not_an_interrupted_one(tmp_path, monkeypatch, code, state):
+    def end(*_):
+        raise SystemExit(code)
+
+    monkeypatch.setattr("jumper_warp.compare.sweep.train_arm", end)
+    path = sweep_file(tmp_path, trials=1)
+    with pytest.raises(SystemExit) if code == INTERRUPTED else nullcontext():
+        work_on(path)
+    assert states(read_sweep(path)) == [state]
+
+
+def test_a_boolean_choice_is_a_flag_or_its_opposite(tmp_path):
+    arguments = read_sweep(sweep_file(tmp_path)).arguments({"noise": True, "ppo.normalise-value": False}, "run")
+    assert arguments[arguments.index("cpu") + 1 :][:3] == ["--noise", "--ppo.no-normalise-value", "--seeds"]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 from jumper_warp.cli.main import main
 from jumper_warp.cli.train import parse_train
 from jumper_warp.compare.training import train_arm
+from jumper_warp.registry import load_task_module
 from jumper_warp.rl.metrics_file import last_metrics
 from jumper_warp.rl.runner import Observer
 from jumper_warp.utils.errors import InputError
@@ -23,6 +24,25 @@ def heavier_height():
 
 
 register_task("heavier-height", heavier_height)
+"""
+FUNCTION = """
+from dataclasses import replace
+import warp as wp
+from jumper_warp import make_task, mdp
+from jumper_warp.registry import register_task
+
+
+@wp.func
+def height(robot: mdp.RobotView, state: mdp.JumpState) -> float:
+    return robot.pos[2]
+
+
+def tall():
+    task = make_task("vertical-jump")
+    return replace(task, name="tall", rewards=(*task.rewards, mdp.RewardTerm(height, weight=1.0)))
+
+
+register_task("tall", tall)
 """
 
 
@@ -64,6 +84,23 @@ def test_an_arm_with_other_settings_is_refused(tmp_path):
     renamed = recipe(tmp_path, "--max-iterations", "1", "--env.rewards.jump-height.weight", "7")
     renamed = dataclasses.replace(renamed, train=dataclasses.replace(renamed.train, run_name="other"))
     assert train_arm(renamed).name.endswith("_other")
+
+
+def test_an_arm_whose_file_has_changed_is_refused(tmp_path):
+    path = tmp_path / "file_of_an_arm.py"
+    path.write_text(FUNCTION)
+    load_task_module(str(path))
+    flags = f"{SMALL} --device cpu --max-iterations 1 --seeds 1 2 --run-name arm --log-root {tmp_path}".split()
+    arm = parse_train(["tall", *flags])[0]
+    assert train_arm(arm) == train_arm(arm)
+    path.write_text(FUNCTION.replace("robot.pos[2]", "2.0 * robot.pos[2]"))
+    with pytest.raises(InputError, match="trained with another file_of_an_arm"):
+        train_arm(arm)
+
+
+def test_an_arm_with_a_space_in_its_name_is_kept(tmp_path):
+    arm = recipe(tmp_path, "--max-iterations", "1", "--run-name", "two words")
+    assert train_arm(arm) == train_arm(arm)
 
 
 @pytest.mark.parametrize(

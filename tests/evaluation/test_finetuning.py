@@ -1,6 +1,7 @@
 """Fine-tuning: jump errors, their reduction by Gauss-Newton, and `jumper finetune`."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ import torch
 
 from jumper_warp.cli.main import main
 from jumper_warp.evaluation.conditions import Conditions, env_of_recipe
-from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.finetuning import finetune, make_groups, mean_abs_errors, shift_goal_observation
 from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
-from jumper_warp.evaluation.jump_errors import ballistic_landing, jump_errors
+from jumper_warp.evaluation.jump_errors import JumpErrors, ballistic_landing, jump_errors
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import RobotOverlay
@@ -130,6 +131,15 @@ def test_ballistic_landing_is_where_a_projectile_on_mars_falls_to_0_3_m():
     time = [np.roots([-0.5 * 3.71, up, height - 0.3]).max() for up, height in zip(vel[:, 2], pos[:, 2], strict=True)]
     expected = pos + vel * np.array(time)[:, None]
     np.testing.assert_allclose(torch.stack(landing).numpy(), expected[:, :2].T, rtol=1e-5)
+
+
+def test_the_miss_of_a_place_is_the_mean_distance_from_the_goal():
+    places, heights = (SimpleNamespace(name=name, commands=np.zeros((3, 4))) for name in ("places", "heights"))
+    value = torch.tensor([0.3, 0.0, 0.0, -0.4, 0.1, 0.0])  # [m] x, then y; the third jump is not valid
+    landed = JumpErrors(value, torch.zeros(0), torch.tensor([True, True, False, True, True, True]))
+    rose = JumpErrors(torch.tensor([0.1, -0.3, 0.0]), torch.zeros(0), torch.tensor([True, True, False]))
+    expected = {"places": 0.3, "heights": 0.2}
+    assert mean_abs_errors([places, heights], [landed, rose]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("seed", [0, 5])

@@ -159,6 +159,12 @@ def test_distance_metrics_without_reliable_bin_are_none():
     assert metrics["bin_paw_to_paw_distance_mean_m"] == [None] and metrics["landing_tilt_max_deg"] is None
 
 
+def test_goals_in_range_may_lie_in_any_direction():
+    aside = goals_ahead([1.0, 1.4, 1.5])[..., ::-1]
+    metrics = distance_metrics({1.0: landing_log(aside, aside, [[NO_JUMP]] * 3)})
+    assert metrics["in_range_success_rate"].trials == 2
+
+
 def test_platform_scenes_have_specified_ground_block_and_headings():
     rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
     scenes = {name: scene for name, *scene in Platform(edge=0.46).scenes(goals, rng)}

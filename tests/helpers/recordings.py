@@ -6,12 +6,15 @@ from jump_helpers import make_env, random_actions
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder
-from jumper_warp.registry import make_task
 
 
-def record_jumps(heights, steps, worlds, on_step=lambda env: None):
-    """Return a recorder of some worlds that were commanded to jump to heights [m], for a number of policy steps."""
-    env, log = make_env(len(heights)), JumpLog(np.array(heights), make_task("vertical-jump").termination_names)
+def record_jumps(heights, steps, worlds, on_step=lambda env: None, **settings):
+    """Return a recorder of some worlds that were commanded to jump to heights [m], for a number of policy steps.
+
+    settings: of the environment.
+    """
+    env = make_env(len(heights), **settings)
+    log = JumpLog(np.array(heights), env.task.termination_names)
     recorder = EnvRecorder(env, log, worlds, notes={"task": "vertical-jump"})
     actions = iter(random_actions(len(heights), steps))
 

@@ -6,9 +6,12 @@ import pytest
 import torch
 
 from jumper_warp.policies.policy import Policy, actor_init_from_policy, task_symmetry
+from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init, make_actor_init
 from jumper_warp.rl.networks import ActorCritic
+from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.training import train
 from jumper_warp.utils.errors import InputError
 
 WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a symmetric actor has twice the widths
@@ -50,6 +53,15 @@ def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, mess
     with pytest.raises(InputError, match=f"init_policy: .*{message}") as caught:
         actor_init_from_policy(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
     assert "\n" not in str(caught.value)
+
+
+def test_the_policy_is_compared_with_the_robot_of_the_training(tmp_path):
+    recipe = Recipe.of("vertical-jump", load_overlay("small_direct_drive"))
+    cfg = dataclasses.replace(
+        recipe.train, init_policy="vertical_jump", num_envs=8, max_iterations=1, device="cpu", log_root=tmp_path
+    )
+    with pytest.raises(InputError, match=r"default angle \[rad\] of \w+: the policy has"):
+        train(dataclasses.replace(recipe, train=cfg))
 
 
 def test_symmetric_training_starts_from_the_projection_of_a_nearly_symmetric_policy():

@@ -36,11 +36,11 @@ def test_newest_and_best_checkpoints_are_kept(tmp_path):
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
-def test_latest_checkpoint_is_the_last_saved_not_the_highest_iteration(tmp_path):
+def test_checkpoints_after_the_one_that_was_resumed_are_removed(tmp_path):
     for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
-        newest = save_checkpoint(tmp_path, state(iteration), max_checkpoints=2)
-        assert latest_checkpoint(tmp_path)[0] == newest
-    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000120", "iteration_000300"]
+        newest = save_checkpoint(tmp_path, state(iteration), 0.001 * iteration, max_checkpoints=2)
+        assert latest_checkpoint(tmp_path)[0] == best_checkpoint(tmp_path) == newest
+    assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000110", "iteration_000120"]
 
 
 def flip(path):

@@ -102,6 +102,12 @@ def spoil(monkeypatch, spoiled, at):
     monkeypatch.setattr(Learner, "update", spoiling)
 
 
+def test_the_end_of_a_run_is_that_of_a_seed_that_did_not_fail(cfg, monkeypatch, capsys):
+    spoil(monkeypatch, {0}, at=1)
+    train(cfg, SeededTask)
+    assert "ended by --max-iterations 4, saved in" in capsys.readouterr().err
+
+
 def test_a_seed_that_diverges_is_frozen_and_the_others_continue(cfg, monkeypatch, capsys):
     spoil(monkeypatch, {1}, at=3)
     result = train(cfg, SeededTask)
@@ -115,10 +121,11 @@ def test_a_seed_that_diverges_is_frozen_and_the_others_continue(cfg, monkeypatch
 
 
 @pytest.mark.parametrize("single", [True, False])
-def test_a_training_fails_if_all_its_seeds_diverge(cfg, monkeypatch, single):
+def test_a_training_fails_if_all_its_seeds_diverge(cfg, monkeypatch, capsys, single):
     spoil(monkeypatch, {0, 1, 2}, at=1)
     with pytest.raises(SystemExit, match="weights are not finite"):
         train(dataclasses.replace(cfg, seeds=()) if single else cfg, SeededTask)
+    assert ("ended by a failure after " in capsys.readouterr().err) != single
 
 
 def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
@@ -128,12 +135,12 @@ def test_a_seed_is_addressed_by_its_number_and_the_median_by_the_run(cfg):
         assert newest_run(f"{result.folder}:{seed}") == folder
         assert newest_run(f"{cfg.log_root / 'push'}:{seed}") == folder
         assert newest_run(folder) == folder
-    scores = [0.3, 0.9, 0.5]
-    for folder, score in zip(folders.values(), scores, strict=True):
-        path = folder / CHECKPOINTS / MANIFEST
-        manifest = json.loads(path.read_text())
-        path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
-    assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[7]
+    for scores, median in (([0.3, 0.9, 0.5], 7), ([None, 0.9, 0.5], 7), ([None, 0.9, None], 1)):
+        for folder, score in zip(folders.values(), scores, strict=True):
+            path = folder / CHECKPOINTS / MANIFEST
+            manifest = json.loads(path.read_text())
+            path.write_text(json.dumps({name: entry | {"score": score} for name, entry in manifest.items()}))
+        assert newest_run(result.folder) == newest_run(cfg.log_root / "push") == folders[median]
     with pytest.raises(InputError, match="no checkpoint of seed 3; seeds with checkpoints: 1, 4, 7"):
         newest_run(f"{result.folder}:3")
 

@@ -49,6 +49,16 @@ def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("success", "shown"), [(0.0, ": 1,234 steps/s, success 0.0 %, "), (float("nan"), "/s, 5 s left")]
+)
+def test_an_undefined_success_is_not_shown(capsys, success, shown):
+    console = TrainingConsole(LOGGED)
+    console.add(1, METRICS | {"Metrics/success": success}, remaining=5.0)
+    console.flush()
+    assert shown in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("content", "kept"),
     [
         (b'{"iteration": 1}\n{"iterat', [1]),
