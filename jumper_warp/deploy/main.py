@@ -72,7 +72,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 DEMO = (
-    (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
+    (0.8, Request.STAND, ()), (1.0, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
     (15.5, Request.JUMP_TO, (0.8, 0.2, 0.0)), (20.5, Request.WALK, (0.4, 0.0, 0.0)),
 )  # fmt: skip

@@ -120,8 +120,8 @@ def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, sil
 
 def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot, capsys):
     """No motor replies, so that the request to stand is refused."""
-    ticks = 300 + 480 + 4  # of the run, and of its end
-    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
+    ticks = 400 + 480 + 4  # of the run, and of its end
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(400 / 480)])
     assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
 
 
@@ -145,8 +145,8 @@ def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp
             """Do nothing."""
 
     monkeypatch.setattr(can, "Logger", Full)
-    ticks = 300 + 480 + 4  # of the run, and of its end
-    args = ["--demo", "--lockstep", "--seconds", str(300 / 480), "--log", str(tmp_path / "log")]
+    ticks = 400 + 480 + 4  # of the run, and of its end
+    args = ["--demo", "--lockstep", "--seconds", str(400 / 480), "--log", str(tmp_path / "log")]
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), *args])
     printed = capsys.readouterr()
     assert printed.out.splitlines() == ["PASSIVE SILENT"]

@@ -10,6 +10,7 @@ from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.log import Log, read_log, replay
 from jumper_warp.deploy.motions import joint_test
 from jumper_warp.deploy.runtime import Request, State
+from jumper_warp.deploy.safety import Fault
 
 
 def run_until(robot, state, ticks=4000):
@@ -28,7 +29,7 @@ def test_walk_and_jump_to_a_place_replay_bit_for_bit(make_robot, bundle, tmp_pat
     robot = make_robot()
     robot.runtime.listener = log.tick
     robot.link.listener = log.frame
-    robot.run(3)
+    robot.run(360)
     assert robot.runtime.state == State.PASSIVE and not robot.far.enabled.any()
     robot.run(150, Request.STAND)
     assert robot.runtime.state == State.STAND_UP and robot.far.enabled.all()
@@ -70,6 +71,21 @@ def test_jump_up_over_the_bus_reaches_its_height(faults, tolerance, make_robot):
     assert robot.runtime.state == State.WALK and robot.far.q[2] > 0.2
 
 
+def test_motors_stay_off_until_the_robot_has_been_at_rest(make_robot):
+    """Without motors the standing robot falls, and lies after 0.3 s."""
+    robot = make_robot(BusFaults(gyro_noise=0.02, accel_noise=0.2), Estimator())
+    robot.run(60)
+    robot.run(60, Request.STAND)
+    assert robot.runtime.state == State.PASSIVE and robot.runtime.reason == Fault.MOVING
+    robot.run(240)
+    robot.run(30, Request.STAND)
+    assert robot.runtime.state == State.STAND_UP and robot.runtime.reason == Fault.NONE
+    assert robot.runtime.estimate.position[2] == pytest.approx(robot.far.q[2], abs=0.03)  # [m]
+    robot.run(1, Request.PASSIVE)
+    robot.run(1, Request.STAND)
+    assert robot.runtime.reason == Fault.MOVING  # earlier readings do not count
+
+
 def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
     """With one frame each, 0.9^12 = 28 % of robots would have all motors on."""
     for seed in range(5):
@@ -82,8 +98,7 @@ def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
 
 def test_dry_run_keeps_the_motors_off(make_robot):
     robot = make_robot(dry_run=True)
-    robot.run(3)
-    records = robot.run(50, Request.STAND)
+    records = robot.enable(50)
     assert robot.runtime.state == State.STAND_UP
     assert not robot.far.enabled.any() and (records[-1]["sent"] == robot.runtime.off).all()
 
