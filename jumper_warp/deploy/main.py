@@ -8,8 +8,9 @@ import json
 import logging
 import os
 import sys
+import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -127,8 +128,13 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         except KeyboardInterrupt:
             pass
         finally:
-            for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+            for request in [Request.STOP, *[Request.NONE] * 2 * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+                begin = time.monotonic()
                 runtime.tick(request)
+                if dog is not None:
+                    with suppress(InputError):  # it brakes too
+                        dog.beat()
+                    time.sleep(max(0.0, begin + 1.0 / rate - time.monotonic()))
         if dog is not None:
             dog.close()
         link.close()

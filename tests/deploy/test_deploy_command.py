@@ -5,6 +5,7 @@ import json
 import shutil
 import socket
 import threading
+import time
 
 import can
 import numpy as np
@@ -120,9 +121,26 @@ def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, sil
 
 def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot, capsys):
     """No motor replies, so that the request to stand is refused."""
-    ticks = 400 + 480 + 4  # of the run, and of its end
+    ticks = 400 + 960 + 4  # of the run, and of its end
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(400 / 480)])
     assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
+
+
+def test_runtime_that_ends_brakes_for_2_s_without_its_watchdog(bundle_folder, tmp_path, monkeypatch):
+    """A beat each tick keeps the watchdog from braking."""
+    beats = []
+
+    class Counted(main.Watchdog):
+        """Watchdog whose beats are recorded."""
+
+        def beat(self):
+            """Record the time of a beat."""
+            beats.append(time.monotonic())
+            super().beat()
+
+    monkeypatch.setattr(main, "Watchdog", Counted)
+    main.main([str(bundle_folder), "--bus", f"unix:{tmp_path}/bus", "--demo", "--seconds", "0.1"])
+    assert len(beats) > 2 * 480 and beats[-1] - beats[0] > 2.0  # [s]
 
 
 def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp_path, monkeypatch, capsys):
@@ -145,7 +163,7 @@ def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp
             """Do nothing."""
 
     monkeypatch.setattr(can, "Logger", Full)
-    ticks = 400 + 480 + 4  # of the run, and of its end
+    ticks = 400 + 960 + 4  # of the run, and of its end
     args = ["--demo", "--lockstep", "--seconds", str(400 / 480), "--log", str(tmp_path / "log")]
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), *args])
     printed = capsys.readouterr()

