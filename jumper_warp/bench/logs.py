@@ -29,9 +29,12 @@ DRIVEN = (State.STAND_UP, State.HOLD, State.WALK, State.JUMP_UP, State.JUMP_TO) 
 def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMotion]:
     """Return the stretches of a log in one state with position control, as motions for identification.
 
-    torque_limit: of the targets' clipping [N m]. Raises InputError: there is none of LEAST_SECONDS.
+    torque_limit: of the targets' clipping [N m]. Raises InputError: there is none of LEAST_SECONDS, or
+    the log is of a dry run.
     """
     ticks, about = read_log(folder)
+    if about.get("dry_run"):
+        raise InputError(f"{folder}: log of a dry run, in which no motor was driven")
     rate = about["rate"]
     state = np.where((ticks["kp"] > 0.0).all(axis=1) & np.isin(ticks["state"], DRIVEN), ticks["state"], -1)
     edges = [0, *(np.flatnonzero(np.diff(state)) + 1), len(state)]

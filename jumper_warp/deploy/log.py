@@ -26,14 +26,15 @@ CONTAINER = 4096  # [bytes] that BLF compresses at once, in 0.1 ms; its own 128 
 class Log:
     """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
-    def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
-        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv.
+    def __init__(self, folder: Path, bundle: Bundle, rate: int, frames: str = "frames.blf", **options: bool) -> None:
+        """Create the files; frames: file name, .asc, .blf or .csv.
 
+        options: `capture`, whether the source is a `MotionCapture`, and `dry_run` of the `Runtime`.
         Raises FileExistsError: the folder has a log.
         """
         folder.mkdir(parents=True, exist_ok=True)
         self._ticks = (folder / TICKS).open("xb")
-        about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
+        about = {"version": VERSION, "rate": rate, "tick_bytes": TICK.itemsize, **options}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
         self._frames: Any = can.Logger(str(folder / frames))
@@ -67,6 +68,7 @@ def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
     about = read_json(folder / ABOUT, "log of a robot")
     known = {"version": [VERSION], "tick_bytes": [TICK.itemsize], "rate": RATES, "capture": [False, True]}
+    known["dry_run"] = [False, True, None]  # None: log of version 0.3
     if not isinstance(about, dict) or any(about.get(name) not in values for name, values in known.items()):
         raise InputError(f"{folder / ABOUT}: damaged, or written by another version of the runtime")
     data = read_file(folder / TICKS, "ticks of a log")
@@ -85,7 +87,7 @@ def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
     source = MotionCapture() if about["capture"] else None
     received = iter(ticks["received"])
     link: Any = SimpleNamespace(send=lambda frames: None, collect=lambda: next(received))
-    runtime = Runtime(bundle, link, source, rate=about["rate"])
+    runtime = Runtime(bundle, link, source, rate=about["rate"], dry_run=bool(about.get("dry_run")))
     for number, logged in enumerate(ticks):
         ours = runtime.tick(Request(int(logged["request"])), logged["values"], float(logged["late"]))
         if ours.tobytes() != logged.tobytes():

@@ -142,7 +142,7 @@ class Runtime:
             frames = self._commands()
         record["state"], record["target"] = self.state, self._target
         record["fault"], record["fault_ticks"] = self.safety.fault or self.reason, self.safety.ticks
-        record["kp"] = 0.0 if self.state in (State.DAMP, State.PASSIVE) else self._gains.kp
+        record["kp"] = self._driven[1]
         return frames
 
     def _read(self, record: np.ndarray) -> None:
@@ -239,6 +239,7 @@ class Runtime:
         self._procedure = None
         self._finite = True
         self._rest_ticks = 0
+        self._driven = (self._target, 0.0 * self.damping, 0.0 * self.damping)  # until `_commands`
         self.state = state
         self._gains = self.bundle.hold
         if state in self.skills:

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from jumper_warp.bench.bus_sim import BusFaults
+from jumper_warp.bench.logs import motions_of_log
 from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.log import Log, read_log, replay
 from jumper_warp.deploy.motions import joint_test
 from jumper_warp.deploy.runtime import Request, State
 from jumper_warp.deploy.safety import Fault
+from jumper_warp.utils.errors import InputError
 
 
 def run_until(robot, state, ticks=4000):
@@ -96,11 +98,33 @@ def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
         assert robot.far.enabled.all()
 
 
-def test_dry_run_keeps_the_motors_off(make_robot):
+def test_dry_run_keeps_the_motors_off_and_its_log_replays(make_robot, bundle, tmp_path):
     robot = make_robot(dry_run=True)
+    log = Log(tmp_path / "log", bundle, 480, capture=True, dry_run=True)
+    robot.runtime.listener = log.tick
     records = robot.enable(50)
     assert robot.runtime.state == State.STAND_UP
     assert not robot.far.enabled.any() and (records[-1]["sent"] == robot.runtime.off).all()
+    log.close()
+    assert replay(tmp_path / "log", bundle)[1] == -1
+    with pytest.raises(InputError, match="dry run"):
+        motions_of_log(tmp_path / "log")
+
+
+def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_path):
+    """While the robot waits for the confirmation, it only damps."""
+    robot = make_robot()
+    log = Log(tmp_path / "log", bundle, 480, capture=True)
+    robot.runtime.listener = log.tick
+    robot.enable(480)
+    robot.run(360, Request.CONFIRM)
+    log.close()
+    (motion,) = motions_of_log(tmp_path / "log")
+    assert len(motion.time) == 360 - 1
+    ticks = read_log(tmp_path / "log")[0]
+    sent = np.array([bundle.joints.codec.decode_command(frames)[2] for frames in ticks["sent"][1:]])
+    entered = (ticks["sent"][1:, :, :7] == 0xFF).all(axis=(1, 2))  # frames that switch motors
+    assert sent[~entered] == pytest.approx(ticks["kp"][:-1][~entered], abs=0.1)
 
 
 def test_zeroing_makes_the_angle_of_one_joint_its_offset(make_robot):
