@@ -134,7 +134,8 @@ def sysid(cfg: SysidCfg) -> None:
     if logs:
         from jumper_warp.bench.logs import motions_of_log
 
-        motions += [motion for log in logs for motion in motions_of_log(log, cfg.torque_limit or 18.0)]
+        given = {"base": cfg.base, "gains": cfg.gain_preset, "torque_limit": cfg.torque_limit}
+        motions += [motion for log in logs for motion in motions_of_log(log, **given)]
     configure_device(cfg.device, cfg.threads)
     result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)

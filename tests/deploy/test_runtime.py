@@ -120,7 +120,10 @@ def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_
     robot.run(360, Request.CONFIRM)
     log.close()
     (motion,) = motions_of_log(tmp_path / "log")
-    assert len(motion.time) == 360 - 1
+    assert len(motion.time) == 360 - 1 and (motion.base, motion.gains, motion.torque_limit) == ("free", "jumping", 18.0)
+    given = {"base": "fixed", "gains": "walking", "torque_limit": 12.0}
+    (motion,) = motions_of_log(tmp_path / "log", **given)
+    assert {name: getattr(motion, name) for name in given} == given
     ticks = read_log(tmp_path / "log")[0]
     sent = np.array([bundle.joints.codec.decode_command(frames)[2] for frames in ticks["sent"][1:]])
     entered = (ticks["sent"][1:, :, :7] == 0xFF).all(axis=(1, 2))  # frames that switch motors
