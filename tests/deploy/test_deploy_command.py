@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import shutil
 import socket
 import threading
@@ -16,7 +17,8 @@ from jumper_warp.deploy import bus, main
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import read_log
-from jumper_warp.deploy.runtime import TICK
+from jumper_warp.deploy.operator import JOYSTICK, Keyboard
+from jumper_warp.deploy.runtime import TICK, Request
 from jumper_warp.utils.errors import InputError
 
 
@@ -169,6 +171,13 @@ def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp
     printed = capsys.readouterr()
     assert printed.out.splitlines() == ["PASSIVE SILENT"]
     assert printed.err.count("the log ends, the robot continues") == 1 and len(written) == 3
+
+
+def test_gamepad_stops_the_robot_when_the_standard_input_is_at_its_end(tmp_path, monkeypatch):
+    (tmp_path / "pad").write_bytes(JOYSTICK.pack(0, 1, 1, 1))  # button 1 is pressed
+    with open(os.devnull) as empty:
+        monkeypatch.setattr("sys.stdin", empty)
+        assert Keyboard(0.7, (0.5, 0.0), str(tmp_path / "pad")).poll()[0] == Request.STOP
 
 
 ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsize}
