@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drive_helpers import session_of
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.skills import SkillNames
 
 
@@ -85,6 +86,15 @@ def test_values_of_the_driver_outlast_a_reset(session):
     parameters = session.env.parameters
     assert parameters.latency.numpy()[0] == 5  # physics steps of 1/480 s
     assert parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()] == pytest.approx(0.2)
+
+
+def test_other_values_of_the_conditions_stay_when_the_driver_changes_one():
+    session = session_of("vertical_jump", conditions=Conditions(device="cpu", threads=1, friction=0.3, latency=10.0))
+    assert session.nominal["friction [1]"] == pytest.approx(0.3)
+    session.set_value("payload [kg]", 1.0)
+    parameters = session.env.parameters
+    assert parameters.latency.numpy()[0] == 5  # physics steps of 1/480 s
+    assert parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()] == pytest.approx(0.3)
 
 
 def test_friction_changes_a_landing(session):
