@@ -68,7 +68,6 @@ def read_log(folder: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the ticks of a log, records of TICK, and its log.json. Raises InputError: it is damaged."""
     about = read_json(folder / ABOUT, "log of a robot")
     known = {"version": [VERSION], "tick_bytes": [TICK.itemsize], "rate": RATES, "capture": [False, True]}
-    known["dry_run"] = [False, True, None]  # None: log of version 0.3
     if not isinstance(about, dict) or any(about.get(name) not in values for name, values in known.items()):
         raise InputError(f"{folder / ABOUT}: damaged, or written by another version of the runtime")
     data = read_file(folder / TICKS, "ticks of a log")

@@ -93,8 +93,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         source = MotionCapture() if options.capture else None
         runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
     link.buses = open_buses(options.bus)
-    kind = {"capture": options.capture, "dry_run": options.dry_run}
-    log = None if options.log is None else Log(options.log, bundle, rate, **kind)
+    log = options.log and Log(options.log, bundle, rate, capture=options.capture, dry_run=options.dry_run)
     if log is not None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)

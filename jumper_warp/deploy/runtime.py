@@ -237,8 +237,7 @@ class Runtime:
         self.pending = None
         self._request = NO_REQUEST
         self._procedure = None
-        self._finite = True
-        self._rest_ticks = 0
+        self._finite, self._rest_ticks = True, 0
         self._driven = (self._target, 0.0 * self.damping, 0.0 * self.damping)  # until `_commands`
         self.state = state
         self._gains = self.bundle.hold

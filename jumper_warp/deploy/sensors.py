@@ -38,8 +38,7 @@ class MotionCapture:
 
     def __init__(self) -> None:
         """Start at the origin, diverged until the first frames arrive."""
-        self._estimate = UNKNOWN
-        self._age = 0  # updates since the last frames
+        self._estimate, self._age = UNKNOWN, 0  # state, and updates since its frames
 
     def reset(self, *readings: Any) -> None:
         """Do nothing: the capture has no state; readings: as `Estimator.reset`."""
