@@ -71,7 +71,7 @@ class Runtime:
         self.dry_run = dry_run
         self.listener: Callable[[np.ndarray], Any] | None = None  # called with the record of every tick
         self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
-        self.motion = Motion(settings["switch"])
+        self.motion = Motion(settings["switch"], self.dt)
         folded = np.array(settings["stand_up"]["folded"], np.float32).reshape(12)
         self._stand_up = ([folded, bundle.default], float(settings["stand_up"]["seconds"]))
         self.skills: dict[State, Skill] = {}
@@ -242,7 +242,7 @@ class Runtime:
         self.state = state
         self._gains = self.bundle.hold
         if state in self.skills:
-            self.skill.begin(np.clip(values, self.skill.lowest, self.skill.highest), self.motion)
+            self.skill.begin(np.clip(values, self.skill.lowest, self.skill.highest), self.motion, self._target)
             self._gains = self.skill.gains
             self._due = self._time  # the policy acts in this tick
         if state == State.HOLD:

@@ -172,3 +172,18 @@ def test_policy_acts_every_eighth_or_ninth_tick_at_500_hz(make_robot):
     for tick in range(100):  # noqa: B007
         robot.run(1)
     assert set(np.diff(acted)) == {8, 9} and len(acted) == 12
+
+
+def test_skill_begins_at_rest_for_0_3_s_with_the_action_of_the_present_targets(make_robot, bundle):
+    robot = make_robot()
+    robot.stand()
+    motion = robot.runtime.motion
+    motion.stood = 0.0
+    rests = [robot.run(1) and motion.at_rest for _ in range(200)]
+    assert rests.index(True) == pytest.approx(144, abs=2)  # ticks
+    target = bundle.default + np.float32(0.1)
+    for state, speed in ((State.WALK, None), (State.JUMP_UP, 0.75), (State.JUMP_TO, 0.25)):
+        skill = robot.runtime.skills[state]
+        skill.begin(np.zeros(3), motion, target)
+        assert skill.policy.default + skill.policy.scale * skill.policy.action == pytest.approx(target)
+        assert speed is None or skill.phase._takeoff_speed == speed  # [m/s]
