@@ -46,10 +46,10 @@ def motions_of_log(folder: Path, **settings: Any) -> list[RecordedMotion]:
         part = ticks[first + 1 : end]
         names = ("angle", "rate", "torque", "position", "quaternion")
         columns: dict[str, Any] = {name: part[name].astype(float) for name in names}
+        columns |= {"gains": "walking" if state[first] == State.WALK else "jumping"} | given
         motion = RecordedMotion(
             f"{folder.name}_{State(int(state[first])).name.lower()}_{first}", time=np.arange(len(part)) / rate,
-            target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
-            **columns, **{"gains": "walking" if state[first] == State.WALK else "jumping"} | given,
+            **columns, target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
         )  # fmt: skip
         motions.append(motion)
     if not motions:

@@ -64,11 +64,9 @@ class Runtime:
         compute commands, and send frames that switch the motors off.
         """
         settings = bundle.settings
-        self.bundle = bundle
-        self.link = link
+        self.bundle, self.link = bundle, link
         self.source = Estimator(EstimatorCfg(**settings["estimator"])) if source is None else source
-        self.dt = 1.0 / rate
-        self.dry_run = dry_run
+        self.dt, self.dry_run = 1.0 / rate, dry_run
         self.listener: Callable[[np.ndarray], Any] | None = None  # called with the record of every tick
         self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
         self.motion = Motion(settings["switch"], self.dt)
@@ -80,14 +78,11 @@ class Runtime:
             state, kind = SKILLS[fields["skill"]]
             self.skills[state] = kind(policy, Gains.from_yaml(fields), fields["commands"])
         self.damping = np.array(settings["safety"]["damping"], dtype=np.float32)
-        self.off = np.tile(np.frombuffer(EXIT, np.uint8), (12, 1))
-        self.enter = np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
+        self.off, self.enter = (np.tile(np.frombuffer(frame, np.uint8), (12, 1)) for frame in (EXIT, ENTER))
         self.frames = self.off
-        self.state = State.PASSIVE
-        self.reason = Fault.NONE
+        self.state, self.reason = State.PASSIVE, Fault.NONE
         self.ready = False  # whether all motors and the IMU have sent frames
-        self.record = np.zeros((), TICK)
-        self.estimate = UNKNOWN
+        self.record, self.estimate = np.zeros((), TICK), UNKNOWN
         self.pending: tuple[State, np.ndarray] | None = None  # jump that waits until walking has come to rest
         self._request = NO_REQUEST  # of a tick with a fault
         self._procedure: Any = None

@@ -18,7 +18,6 @@ from jumper_warp.deploy.sensors import Estimate
 
 SQUAT_STEPS = 30  # policy steps from a jump skill's begin to its command
 STAND_TIME = 0.3  # [s] of contact of each paw of a standing robot
-TAKEOFF_SPEEDS = (0.75, 0.25)  # [m/s] upward, of jumps up and to a place
 LANDED_STEPS, RECOVER_STEPS, NO_JUMP_STEPS = 18, 60, 150
 """Policy steps after landing before which a jump never ends, after which it ends, and after which it ends without one.
 """
@@ -147,7 +146,7 @@ class Jump(Skill):
         self.goal = motion.estimate.position[:2] + motion.heading @ values[:2]
         self.steps = 0
         self.landed = 0  # policy steps since landing
-        self.phase = JumpCommand(TAKEOFF_SPEEDS["goal" in self.policy.layout])
+        self.phase = JumpCommand(0.25 if "goal" in self.policy.layout else 0.75)  # [m/s] as in training
         self.took_off = False
 
     def command(self, motion: Motion) -> dict[str, Any]:
