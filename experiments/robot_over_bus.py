@@ -121,9 +121,9 @@ class Bench:
         sim = self.direct[state]
         sim.reset()
         runtime = Runtime(self.bundle, self.link)
-        skill, motion, rows = runtime.skills[state], Motion(self.bundle.settings["switch"]), []
+        skill, motion, rows = runtime.skills[state], Motion(self.bundle.settings["switch"], 1.0 / 60.0), []
         read_state(sim, motion)
-        skill.begin(commands[0], motion)
+        skill.begin(commands[0], motion, self.bundle.default)
         for command in commands:
             if state == State.WALK:
                 cast("Walk", skill).wanted = command

@@ -16,7 +16,7 @@ import yaml
 from jumper_warp.bench.vectors import vectors_bytes
 from jumper_warp.deploy.bundle import FILE, VERSION, settings_hash
 from jumper_warp.deploy.codec import dbc
-from jumper_warp.deploy.policy import JOINTS
+from jumper_warp.deploy.policy import JOINTS, LAST_ACTION
 from jumper_warp.policies.onnx import onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyInterface, checksum_entry
@@ -27,6 +27,8 @@ from jumper_warp.utils.files import write_atomically
 
 SKILL_OF_COMMAND = {"wanted_height": "jump_up", "goal": "jump_to", "command": "walk"}
 """Skill of a policy by the observation term that holds its command."""
+READ_TERMS = {"height", "lin_vel", "ang_vel", "gravity", "angle", "rate", LAST_ACTION}
+"""Observation terms beside those of the command that the runtime computes."""
 COMMAND_RANGES = {
     "walk": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-1.0, 1.0]},
     "jump_up": {"wanted_height": [0.5, 1.0]},
@@ -36,9 +38,12 @@ COMMAND_RANGES = {
 
 
 def skill_of(interface: PolicyInterface) -> str:
-    """Return the skill of a policy: walk, jump_up or jump_to. Raises InputError: the runtime has none for it."""
+    """Return the skill of a policy: walk, jump_up or jump_to. Raises InputError: the runtime cannot run it."""
     for term, skill in SKILL_OF_COMMAND.items():
         if term in interface.observation_layout:
+            commands = {term} if skill == "walk" else {"wanted_height", "jump_command", "goal"}
+            if unread := interface.observation_layout.keys() - READ_TERMS - commands:
+                raise InputError(f"{interface.task}: the runtime cannot compute the observation {min(unread)}")
             return skill
     raise InputError(f"{interface.task}: a bundle takes policies that walk, jump up or jump to a place")
 
@@ -140,7 +145,7 @@ def runtime_archive() -> bytes:
 def export_bundle(policies: Sequence[tuple[str, Policy]], folder: Path) -> Path:
     """Write a bundle of named policies to a folder, and return it.
 
-    Raises InputError: two policies have the same skill, or one has none.
+    Raises InputError: two policies have the same skill, or the runtime cannot run one.
     """
     settings = robot_settings()
     files: dict[str, bytes] = {}

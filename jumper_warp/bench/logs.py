@@ -26,12 +26,16 @@ MOTORS = [7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]  # columns of 
 DRIVEN = (State.STAND_UP, State.HOLD, State.WALK, State.JUMP_UP, State.JUMP_TO)  # states with position control
 
 
-def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMotion]:
+def motions_of_log(folder: Path, **settings: Any) -> list[RecordedMotion]:
     """Return the stretches of a log in one state with position control, as motions for identification.
 
-    torque_limit: of the targets' clipping [N m]. Raises InputError: there is none of LEAST_SECONDS.
+    settings: `base`, `gains` and `torque_limit` [N m] of all motions; "" or 0: free, those of the state, 18.
+    Raises InputError: there is none of LEAST_SECONDS, or the log is of a dry run.
     """
     ticks, about = read_log(folder)
+    if about.get("dry_run"):
+        raise InputError(f"{folder}: log of a dry run, in which no motor was driven")
+    given = {name: value for name, value in settings.items() if value}
     rate = about["rate"]
     state = np.where((ticks["kp"] > 0.0).all(axis=1) & np.isin(ticks["state"], DRIVEN), ticks["state"], -1)
     edges = [0, *(np.flatnonzero(np.diff(state)) + 1), len(state)]
@@ -42,11 +46,10 @@ def motions_of_log(folder: Path, torque_limit: float = 18.0) -> list[RecordedMot
         part = ticks[first + 1 : end]
         names = ("angle", "rate", "torque", "position", "quaternion")
         columns: dict[str, Any] = {name: part[name].astype(float) for name in names}
+        columns |= {"gains": "walking" if state[first] == State.WALK else "jumping"} | given
         motion = RecordedMotion(
             f"{folder.name}_{State(int(state[first])).name.lower()}_{first}", time=np.arange(len(part)) / rate,
-            target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
-            torque_limit=torque_limit, **columns,
-            gains="walking" if state[first] == State.WALK else "jumping",
+            **columns, target=ticks["target"][first : end - 1].astype(float),  # sent with the next tick
         )  # fmt: skip
         motions.append(motion)
     if not motions:

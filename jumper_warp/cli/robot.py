@@ -79,7 +79,8 @@ def robot_at(source: str) -> RobotOverlay:
 
 
 def new(cfg: NewCfg) -> None:
-    """Write the table of a robot to a folder, which must not have one, and print the file's path."""
+    """Write the table of a robot to a folder, which must not have one; print the values that it loses, and its path."""
+    from jumper_warp.robot.export import LOST
     from jumper_warp.robot.folder import FILE, read_urdf, table_of, write_robot
     from jumper_warp.robot.values import described
 
@@ -91,6 +92,11 @@ def new(cfg: NewCfg) -> None:
         robot = robot_at(cfg.like)
         table = robot.robot if robot.robot and not robot.values else None
         table = table or table_of(described(robot.robots(), robot.description), cfg.like)
+        types = [motor.type for motor in robot.description.motors]
+        kinds = {name: len({*zip(types, row, strict=False)}) for name, row in robot.values.items() if len(row) == 12}
+        lost = [name for name in robot.values if name in LOST[FILE] or kinds.get(name, 0) > len({*types})]
+        if lost:
+            print(f"{FILE} has no place for these values of {cfg.like}, or one a type of motor: {', '.join(lost)}")
     print(write_robot(cfg.out, {**table, "name": cfg.out.name}))
 
 

@@ -127,14 +127,14 @@ def sysid(cfg: SysidCfg) -> None:
     settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["description"] = robot
     settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std, robot)]
-    recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
+    recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit")} | {"gains": cfg.gain_preset}
     logs = [path for path in cfg.data if (path / "ticks.bin").is_file()]
     files = [path for path in cfg.data if path not in logs]
-    motions = load_motions(files, gains=cfg.gain_preset, **recorded_with) if files else []
+    motions = load_motions(files, torque_constant=cfg.torque_constant, **recorded_with) if files else []
     if logs:
         from jumper_warp.bench.logs import motions_of_log
 
-        motions += [motion for log in logs for motion in motions_of_log(log, cfg.torque_limit or 18.0)]
+        motions += [motion for log in logs for motion in motions_of_log(log, **recorded_with)]
     configure_device(cfg.device, cfg.threads)
     result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)

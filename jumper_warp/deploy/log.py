@@ -26,14 +26,15 @@ CONTAINER = 4096  # [bytes] that BLF compresses at once, in 0.1 ms; its own 128 
 class Log:
     """Files of a run in a folder: ticks.bin, log.json, deploy.yaml and the frames."""
 
-    def __init__(self, folder: Path, bundle: Bundle, rate: int, *, capture: bool, frames: str = "frames.blf") -> None:
-        """Create the files; capture: whether the source is a `MotionCapture`; frames: file name, .asc, .blf or .csv.
+    def __init__(self, folder: Path, bundle: Bundle, rate: int, frames: str = "frames.blf", **options: bool) -> None:
+        """Create the files; frames: file name, .asc, .blf or .csv.
 
+        options: `capture`, whether the source is a `MotionCapture`, and `dry_run` of the `Runtime`.
         Raises FileExistsError: the folder has a log.
         """
         folder.mkdir(parents=True, exist_ok=True)
         self._ticks = (folder / TICKS).open("xb")
-        about = {"version": VERSION, "rate": rate, "capture": capture, "tick_bytes": TICK.itemsize}
+        about = {"version": VERSION, "rate": rate, "tick_bytes": TICK.itemsize, **options}
         (folder / ABOUT).write_text(json.dumps(about), encoding="utf-8")
         (folder / FILE).write_bytes((bundle.folder / FILE).read_bytes())
         self._frames: Any = can.Logger(str(folder / frames))
@@ -85,7 +86,7 @@ def replay(folder: Path, bundle: Bundle) -> tuple[int, int]:
     source = MotionCapture() if about["capture"] else None
     received = iter(ticks["received"])
     link: Any = SimpleNamespace(send=lambda frames: None, collect=lambda: next(received))
-    runtime = Runtime(bundle, link, source, rate=about["rate"])
+    runtime = Runtime(bundle, link, source, rate=about["rate"], dry_run=bool(about.get("dry_run")))
     for number, logged in enumerate(ticks):
         ours = runtime.tick(Request(int(logged["request"])), logged["values"], float(logged["late"]))
         if ours.tobytes() != logged.tobytes():

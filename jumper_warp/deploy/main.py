@@ -8,8 +8,9 @@ import json
 import logging
 import os
 import sys
+import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 DEMO = (
-    (0.5, Request.STAND, ()), (0.7, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
+    (0.8, Request.STAND, ()), (1.0, Request.CONFIRM, ()), (5.5, Request.WALK, (0.4, 0.0, 0.0)),
     (8.0, Request.JUMP_UP, (0.8, 0.0, 0.0)), (13.0, Request.WALK, (0.3, 0.0, 0.3)),
     (15.5, Request.JUMP_TO, (0.8, 0.2, 0.0)), (20.5, Request.WALK, (0.4, 0.0, 0.0)),
 )  # fmt: skip
@@ -92,7 +93,7 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         source = MotionCapture() if options.capture else None
         runtime = Runtime(bundle, link, source, rate=rate, dry_run=options.dry_run)
     link.buses = open_buses(options.bus)
-    log = None if options.log is None else Log(options.log, bundle, rate, capture=options.capture)
+    log = options.log and Log(options.log, bundle, rate, capture=options.capture, dry_run=options.dry_run)
     if log is not None:
         link.listener, runtime.listener = log.frame, log.tick
     dog = None if options.lockstep else Watchdog(options.bus, bundle.settings)
@@ -127,8 +128,13 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
         except KeyboardInterrupt:
             pass
         finally:
-            for request in [Request.STOP, *[Request.NONE] * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+            for request in [Request.STOP, *[Request.NONE] * 2 * rate, Request.PASSIVE, Request.NONE, Request.NONE]:
+                begin = time.monotonic()
                 runtime.tick(request)
+                if dog is not None:
+                    with suppress(InputError):  # it brakes too
+                        dog.beat()
+                    time.sleep(max(0.0, begin + 1.0 / rate - time.monotonic()))
         if dog is not None:
             dog.close()
         link.close()

@@ -44,8 +44,8 @@ class Keyboard:
 
     def poll(self) -> Command:
         """Return the request since the last call."""
-        if select.select([sys.stdin], [], [], 0.0)[0]:
-            return self.key(os.read(sys.stdin.fileno(), 1).decode(errors="replace"))
+        if select.select([sys.stdin], [], [], 0.0)[0] and (key := os.read(sys.stdin.fileno(), 1)):  # b"": at its end
+            return self.key(key.decode(errors="replace"))
         if self._pad is not None:
             with suppress(BlockingIOError):
                 return self.event(*JOYSTICK.unpack(os.read(self._pad, JOYSTICK.size))[1:])

@@ -28,8 +28,9 @@ State = IntEnum("State", "PASSIVE STAND_UP HOLD WALK JUMP_UP JUMP_TO DAMP LANDIN
 """States of the robot. PASSIVE: motors off; STAND_UP: from any lying pose, after a confirmation; HOLD: stand in the
 default pose; DAMP: motors brake; LANDING: a fault in flight, the landing pose until touchdown."""
 Request = IntEnum("Request", "NONE PASSIVE STAND CONFIRM HOLD WALK JUMP_UP JUMP_TO STOP ZERO JOINT", start=0)
-"""Requests of the operator. STAND enables the motors, which brake; CONFIRM stands up, and in HOLD tests legs' signs.
-ZERO makes the present angle of a joint, values[0], its zero, in PASSIVE; JOINT moves a joint, in HOLD on a stand."""
+"""Requests of the operator. STAND enables the motors of a robot at rest, which brake; CONFIRM stands up, and in HOLD
+tests legs' signs. ZERO makes the present angle of a joint, values[0], its zero, in PASSIVE; JOINT moves a joint, in
+HOLD on a stand."""
 NO_REQUEST: tuple[Request, Any] = (Request.NONE, ())
 SKILLS = {"walk": (State.WALK, Walk), "jump_up": (State.JUMP_UP, Jump), "jump_to": (State.JUMP_TO, Jump)}
 JUMPS = (State.JUMP_UP, State.JUMP_TO)
@@ -38,6 +39,7 @@ DRIVERLESS = (State.PASSIVE, State.DAMP, State.LANDING)  # states that a fault d
 RATES = (480, 500)  # [Hz] ticks a second
 ENTER_TICKS = 5  # in each of which the motors are switched on, since a frame can be lost
 REST_TICKS = 96  # over which the readings of a robot at rest are averaged
+REST_RATE = 0.2  # [rad/s] largest reading of gyro and motor rates at rest; noise of 0.02 rad/s reaches 0.1
 CLOCK = 240_000  # units of time a second, in which policy steps and ticks of 480 and 500 Hz are whole numbers
 TICK = np.dtype([
     ("received", RECEIVED), ("late", "f4"), ("request", "i1"), ("values", "f4", 3), ("sent", "u1", (12, 8)),
@@ -62,14 +64,12 @@ class Runtime:
         compute commands, and send frames that switch the motors off.
         """
         settings = bundle.settings
-        self.bundle = bundle
-        self.link = link
+        self.bundle, self.link = bundle, link
         self.source = Estimator(EstimatorCfg(**settings["estimator"])) if source is None else source
-        self.dt = 1.0 / rate
-        self.dry_run = dry_run
+        self.dt, self.dry_run = 1.0 / rate, dry_run
         self.listener: Callable[[np.ndarray], Any] | None = None  # called with the record of every tick
         self.safety = Safety(settings["safety"], settings["closed_chain"]["transversal_sum"])
-        self.motion = Motion(settings["switch"])
+        self.motion = Motion(settings["switch"], self.dt)
         folded = np.array(settings["stand_up"]["folded"], np.float32).reshape(12)
         self._stand_up = ([folded, bundle.default], float(settings["stand_up"]["seconds"]))
         self.skills: dict[State, Skill] = {}
@@ -78,14 +78,11 @@ class Runtime:
             state, kind = SKILLS[fields["skill"]]
             self.skills[state] = kind(policy, Gains.from_yaml(fields), fields["commands"])
         self.damping = np.array(settings["safety"]["damping"], dtype=np.float32)
-        self.off = np.tile(np.frombuffer(EXIT, np.uint8), (12, 1))
-        self.enter = np.tile(np.frombuffer(ENTER, np.uint8), (12, 1))
+        self.off, self.enter = (np.tile(np.frombuffer(frame, np.uint8), (12, 1)) for frame in (EXIT, ENTER))
         self.frames = self.off
-        self.state = State.PASSIVE
-        self.reason = Fault.NONE
+        self.state, self.reason = State.PASSIVE, Fault.NONE
         self.ready = False  # whether all motors and the IMU have sent frames
-        self.record = np.zeros((), TICK)
-        self.estimate = UNKNOWN
+        self.record, self.estimate = np.zeros((), TICK), UNKNOWN
         self.pending: tuple[State, np.ndarray] | None = None  # jump that waits until walking has come to rest
         self._request = NO_REQUEST  # of a tick with a fault
         self._procedure: Any = None
@@ -95,7 +92,8 @@ class Runtime:
         self._asked = np.zeros(12)  # [N m] torque that the last frames asked for
         self._contact = np.zeros(4, bool)
         self._enter_ticks = 0  # ticks for which the motors are still to be switched on
-        self._rest, self._rest_ticks = np.zeros(18), 0  # mean of gyro, accelerometer and angles in PASSIVE
+        self._rest, self._rest_ticks = np.zeros(18), 0  # mean of gyro, accelerometer and angles at rest in PASSIVE
+        self.source.reset(np.zeros(3), np.array([0.0, 0.0, 1.0]), bundle.default)  # until the robot rests
         self._time, self._due = 0, 0  # of the tick, and of the next policy step
         self._step, self._policy_step = CLOCK // rate, CLOCK // 60
         self._imu_count, self._finite = -1, True
@@ -139,7 +137,7 @@ class Runtime:
             frames = self._commands()
         record["state"], record["target"] = self.state, self._target
         record["fault"], record["fault_ticks"] = self.safety.fault or self.reason, self.safety.ticks
-        record["kp"] = 0.0 if self.state in (State.DAMP, State.PASSIVE) else self._gains.kp
+        record["kp"] = self._driven[1]
         return frames
 
     def _read(self, record: np.ndarray) -> None:
@@ -151,9 +149,10 @@ class Runtime:
         self._imu_count = count
         self.ready |= bool(received["motor_fresh"].all() and not self.stale)
         if self.ready and self.state == State.PASSIVE:
-            self._rest_ticks = min(self._rest_ticks + 1, REST_TICKS)
-            self._rest += (np.concatenate([self.gyro, self.accel, self.q]) - self._rest) / self._rest_ticks
-            if self._rest_ticks == 1 or record["request"] == Request.STAND:
+            moves = max(np.abs(self.gyro).max(), np.abs(self.qd).max()) > REST_RATE
+            self._rest_ticks = 0 if moves else min(self._rest_ticks + 1, REST_TICKS)
+            self._rest += (np.concatenate([self.gyro, self.accel, self.q]) - self._rest) / max(1, self._rest_ticks)
+            if self._rest_ticks == 1 or (record["request"] == Request.STAND and not moves):
                 self.source.reset(self._rest[:3], self._rest[3:6], self._rest[6:])
         if self.ready:
             if received["sensor_fresh"][2:].all():
@@ -188,7 +187,8 @@ class Runtime:
             self._rest_ticks = 0
             return frames
         if request == Request.STAND:
-            self.reason = self.safety.fault if self.ready else Fault.SILENT
+            waits = Fault.MOVING if self._rest_ticks < REST_TICKS else Fault.NONE
+            self.reason = (self.safety.fault or waits) if self.ready else Fault.SILENT
             if not self.reason:
                 self._enter(State.STAND_UP)
                 self._enter_ticks = ENTER_TICKS
@@ -232,11 +232,12 @@ class Runtime:
         self.pending = None
         self._request = NO_REQUEST
         self._procedure = None
-        self._finite = True
+        self._finite, self._rest_ticks = True, 0
+        self._driven = (self._target, 0.0 * self.damping, 0.0 * self.damping)  # until `_commands`
         self.state = state
         self._gains = self.bundle.hold
         if state in self.skills:
-            self.skill.begin(np.clip(values, self.skill.lowest, self.skill.highest), self.motion)
+            self.skill.begin(np.clip(values, self.skill.lowest, self.skill.highest), self.motion, self._target)
             self._gains = self.skill.gains
             self._due = self._time  # the policy acts in this tick
         if state == State.HOLD:

@@ -19,12 +19,13 @@ HOLD_TICKS = 4  # Ticks with a fault through which the motors keep their last ta
 
 Fault = IntEnum("Fault", (
     "NONE", "SILENT", "BUS_OFF", "ERROR_FRAME", "WRONG_ID", "MOTOR_ERROR", "TEMPERATURE", "TORQUE", "SPEED", "POSITION",
-    "TILT", "STALE", "DIVERGED", "NOT_FINITE", "LATE", "STOP", "SIGN",
+    "TILT", "STALE", "DIVERGED", "NOT_FINITE", "LATE", "STOP", "SIGN", "MOVING",
 ), start=0)  # fmt: skip
 """Faults that end a policy. SILENT: a motor does not reply; BUS_OFF: a bus cannot send; ERROR_FRAME: many of them in a
 tick; WRONG_ID: a frame of another id scheme; TORQUE: a motor exceeds its torque limit and the torque of its command;
 STALE: the IMU sends nothing new; DIVERGED: the state is unknown; NOT_FINITE: action or observation of the policy; STOP:
-of the operator; SIGN: a joint or a leg does not move as it should."""
+of the operator; SIGN: a joint or a leg does not move as it should; MOVING: not at rest for 0.2 s before the
+operator enables the motors."""
 ACTING = {Fault[name] for name in "WRONG_ID MOTOR_ERROR TEMPERATURE SPEED POSITION TILT STOP SIGN".split()}
 """Faults that end the policy at once."""
 

@@ -17,6 +17,7 @@ GYRO_SCALE, ACCEL_SCALE = 40.0 / 32767, 320.0 / 32767  # [rad/s], [m/s²] of a c
 LENGTH_SCALE, SPEED_SCALE, QUATERNION_SCALE = 5.0e-5, 2.5e-5, 1.0 / 16383  # [m], [m/s], [1] of a code
 BITS = 21  # of each component of a captured position or velocity
 HALF = 1 << (BITS - 1)
+MAX_AGE = 24  # Ticks without frames of the motion capture after which the state is unknown
 
 
 class Estimate(NamedTuple):
@@ -37,18 +38,19 @@ class MotionCapture:
 
     def __init__(self) -> None:
         """Start at the origin, diverged until the first frames arrive."""
-        self._estimate = UNKNOWN
+        self._estimate, self._age = UNKNOWN, 0  # state, and updates since its frames
 
     def reset(self, *readings: Any) -> None:
         """Do nothing: the capture has no state; readings: as `Estimator.reset`."""
 
     def receive(self, frames: np.ndarray) -> None:
         """Take the frames of position, velocity and attitude, (3, 8) uint8."""
-        self._estimate = unpack_capture(frames)
+        self._estimate, self._age = unpack_capture(frames), 0
 
     def update(self, *readings: Any) -> Estimate:
-        """Return the state of the newest frames; readings: as `Estimator.update`."""
-        return self._estimate
+        """Return the state of the newest frames, diverged if older than MAX_AGE; readings: as `Estimator.update`."""
+        self._age += 1
+        return self._estimate._replace(diverged=True) if self._age > MAX_AGE else self._estimate
 
 
 def pack_imu(gyro: np.ndarray, accel: np.ndarray, count: int) -> list[bytes]:

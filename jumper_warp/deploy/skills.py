@@ -17,7 +17,7 @@ from jumper_warp.deploy.policy import LAST_ACTION, DeployedPolicy, JumpCommand
 from jumper_warp.deploy.sensors import Estimate
 
 SQUAT_STEPS = 30  # policy steps from a jump skill's begin to its command
-STAND_STEPS = 18  # policy steps of contact of each paw of a standing robot
+STAND_TIME = 0.3  # [s] of contact of each paw of a standing robot
 LANDED_STEPS, RECOVER_STEPS, NO_JUMP_STEPS = 18, 60, 150
 """Policy steps after landing before which a jump never ends, after which it ends, and after which it ends without one.
 """
@@ -39,18 +39,21 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray, *, inverse: bool = False)
 class Motion:
     """Readings of a policy step that all skills share, and how long the paws have been down."""
 
-    def __init__(self, switch: Mapping[str, float]) -> None:
-        """Start without readings; switch: section of deploy.yaml, limits of a robot at rest near the default pose."""
+    def __init__(self, switch: Mapping[str, float], dt: float) -> None:
+        """Start without readings; dt: time between updates [s].
+
+        switch: section of deploy.yaml, limits of a robot at rest near the default pose.
+        """
         names = ("rest_speed", "rest_spin", "rest_tilt", "max_offset")  # [m/s], [rad/s], [rad], [rad]
         self.rest_speed, self.rest_spin, self.rest_tilt, self.max_offset = (float(switch[name]) for name in names)
-        self.stood = 0  # policy steps for which all paws have been down
+        self.dt, self.stood = dt, 0.0  # [s] stood: for which all paws have been down
 
     def update(self, estimate: Estimate, gyro: np.ndarray, q: np.ndarray, qd: np.ndarray) -> None:
-        """Take the state of a policy step; gyro: (3,) [rad/s], q: (12,) [rad], qd: (12,) [rad/s]."""
+        """Take the state; gyro: (3,) [rad/s], q: (12,) [rad], qd: (12,) [rad/s]."""
         self.estimate, self.gyro, self.q, self.qd = estimate, gyro, q, qd
         self.gravity = rotate(estimate.quaternion, np.array([0.0, 0.0, -1.0]), inverse=True)
         self.velocity = rotate(estimate.quaternion, estimate.velocity, inverse=True)
-        self.stood = self.stood + 1 if estimate.contact.all() else 0
+        self.stood = self.stood + self.dt if estimate.contact.all() else 0.0
 
     @property
     def heading(self) -> np.ndarray:
@@ -62,7 +65,7 @@ class Motion:
     def at_rest(self) -> bool:
         """Whether the robot stands still."""
         slow = np.linalg.norm(self.velocity) < self.rest_speed and np.linalg.norm(self.gyro) < self.rest_spin
-        return bool(self.stood > STAND_STEPS and slow and self.gravity[2] < -np.cos(self.rest_tilt))
+        return bool(self.stood > STAND_TIME and slow and self.gravity[2] < -np.cos(self.rest_tilt))
 
     def readings(self) -> dict[str, Any]:
         """Return the readings of `DeployedPolicy.targets` that do not depend on the command.
@@ -87,9 +90,13 @@ class Skill(ABC):
         self.gains = gains
         self.done = False  # whether the skill has ended
 
-    def begin(self, values: np.ndarray, motion: Motion) -> None:
-        """Start the skill; values: (3,) of the request."""
+    def begin(self, values: np.ndarray, motion: Motion, target: np.ndarray) -> None:
+        """Start the skill; values: (3,) of the request; target: (12,) [rad] present motor targets.
+
+        The last action is the one that yields these targets, as in `kernels/mdp/handover.py`.
+        """
         self.policy.reset()
+        self.policy.action = np.clip((target - self.policy.default) / self.policy.scale, -1.0, 1.0, dtype=np.float32)
         self.done = False
 
     def targets(self, motion: Motion) -> np.ndarray:
@@ -108,9 +115,9 @@ class Skill(ABC):
 class Walk(Skill):
     """Walking with a commanded velocity: ahead, left [m/s], about z [rad/s]."""
 
-    def begin(self, values: np.ndarray, motion: Motion) -> None:
+    def begin(self, values: np.ndarray, motion: Motion, target: np.ndarray) -> None:
         """Start with the velocity 0; values: commanded velocity (3,)."""
-        super().begin(values, motion)
+        super().begin(values, motion, target)
         self.velocity = np.zeros(3)
         self.wanted = np.array(values, dtype=float)
         self.waited = 0
@@ -132,14 +139,14 @@ class Walk(Skill):
 class Jump(Skill):
     """Jump to a height (`wanted_height`) or to a place (`goal`)."""
 
-    def begin(self, values: np.ndarray, motion: Motion) -> None:
+    def begin(self, values: np.ndarray, motion: Motion, target: np.ndarray) -> None:
         """Start squatting; values: height of the base at the apex [m], or place ahead and left of the base [m]."""
-        super().begin(values, motion)
+        super().begin(values, motion, target)
         self.height = float(values[0])
         self.goal = motion.estimate.position[:2] + motion.heading @ values[:2]
         self.steps = 0
         self.landed = 0  # policy steps since landing
-        self.phase = JumpCommand()
+        self.phase = JumpCommand(0.25 if "goal" in self.policy.layout else 0.75)  # [m/s] as in training
         self.took_off = False
 
     def command(self, motion: Motion) -> dict[str, Any]:

@@ -54,7 +54,8 @@ def brake(link: Link, settings: dict[str, Any], seconds: float, sleep: Callable[
     """Send damping commands for some seconds, then exit frames."""
     damping = np.array(settings["safety"]["damping"])
     frames = JointMap(settings).frames(np.zeros(12), np.zeros(12), damping)
-    for _ in range(max(1, round(seconds / PERIOD))):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
         link.send(frames)
         sleep(PERIOD)
     for _ in range(3):

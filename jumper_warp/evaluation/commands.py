@@ -286,6 +286,7 @@ def play_dump(cfg: DumpCfg) -> Path:
 
     found, header = load_dump(cfg.dump)
     from jumper_warp.evaluation.recorder import ankles, save_recording
+    from jumper_warp.robot.overlay import RobotOverlay
     from jumper_warp.sim.simulation import Simulation
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.runtime import configure_device
@@ -293,7 +294,8 @@ def play_dump(cfg: DumpCfg) -> Path:
     from jumper_warp.viz.recording import FARTHEST
 
     configure_device("cpu")
-    sim = Simulation(1, device="cpu")
+    robot = header["config"].get("env", {}).get("robot")
+    sim = Simulation(1, robot=robot and RobotOverlay.from_json(robot), device="cpu")
     q, qd = (np.where(np.abs(x) < FARTHEST, x, 0.0) for x in (found.arrays["joint_q"], found.arrays["joint_qd"]))
     sim.state.joint_q.assign(q)  # 0 in place of values that are not finite or cannot be drawn
     sim.state.joint_qd.assign(qd)

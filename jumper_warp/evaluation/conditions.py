@@ -129,14 +129,14 @@ def shared_robot(robots: Mapping[str, RobotOverlay | None], conditions: Conditio
 
     robots: overlays of the trainings by name of the policy. One line on standard error names policies of the described
     robot that get the overlay of another one. The overlay of `conditions` replaces all of these.
-    Raises PolicyError: policies were trained with different overlays.
+    Raises PolicyError: policies were trained with different robots or overlays.
     """
     saved = {name: overlay.to_json() for name, overlay in robots.items() if overlay is not None}
     if conditions.robot is not None or not saved:
         return None
     first, *others = saved
     for other in others:
-        if any(saved[other][key] != saved[first][key] for key in ("values", "randomization")):
+        if any(saved[other].get(key) != saved[first].get(key) for key in ("robot", "values", "randomization")):
             raise PolicyError(f"{first} and {other} were trained with different robots: choose one with --robot FILE")
     if without := [name for name in robots if name not in saved]:
         described = f"{' and '.join(without)} {'were' if len(without) > 1 else 'was'} trained without"

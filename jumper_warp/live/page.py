@@ -21,6 +21,7 @@ from jumper_warp.live.plots import Plots
 from jumper_warp.live.recordings import Take
 from jumper_warp.live.session import GROUNDS, MAX_VALUES, Session
 from jumper_warp.robot.model import build_model
+from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.shapes import shape_meshes
 from jumper_warp.viz.viser import ViserScene
 
@@ -101,7 +102,10 @@ class Page:
         due = time.perf_counter()
         while not self.stopped:
             while not self.requests.empty():
-                self.requests.get()()
+                try:
+                    self.requests.get()()
+                except InputError as error:
+                    self.notify("Refused", str(error))
             if self.visitors and not self.paused:
                 self.advance()
             due += dt / self.speed

@@ -99,6 +99,7 @@ class Session:
         for policy in self.policies:
             if policy is not None:
                 policy.to(self.env.device)
+        self.env.reset()  # sets the conditions' friction and latency
         self.nominal = self._nominal_values()
         self.reset()
 
@@ -263,7 +264,7 @@ class Session:
     # ------------------------------------------------------------------ physical values
 
     def _nominal_values(self) -> dict[str, float]:
-        """Return the values of `MAX_VALUES` of the environment as built."""
+        """Return the values of `MAX_VALUES` of the environment after its first reset."""
         parameters = self.env.parameters
         mu = parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()[0]]
         names = ("mass", "inv_mass", "inertia", "inv_inertia")

@@ -22,8 +22,9 @@ LOST = {
     "urdf": ("offset", "latency", "cutoff_speed", "kp", "kd", "armature", "motor_friction", "knee_damping",
              "paw_friction", "spring_stiffness", "spring_length"),
     "usd": ("offset", "latency", "cutoff_speed", "spring_stiffness", "spring_length"),
+    "robot.json": ("offset", "latency", "saturation", "paw_friction"),
 }  # fmt: skip
-"""Quantities of an overlay that a format has no place for, by format."""
+"""Quantities of an overlay that a format has no place for, by format of `export_robot`, and of a robot's folder."""
 
 
 def export_robot(

@@ -9,7 +9,7 @@ from jumper_warp.bench.bundle import export_bundle
 from jumper_warp.bench.bus_sim import BusSim, make_simulation
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.bus import Link, open_buses
-from jumper_warp.deploy.runtime import Request, Runtime, State
+from jumper_warp.deploy.runtime import REST_TICKS, Request, Runtime, State
 from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.policies.policy import load_policy
 
@@ -55,10 +55,17 @@ class Robot:
         records = [self.runtime.tick(request, values, late).copy()]
         return records + [self.runtime.tick(late=late).copy() for _ in range(ticks - 1)]
 
+    def enable(self, ticks=6):
+        """Enable the motors of a robot that stands at rest although they are off, and run some ticks."""
+        for _ in range(REST_TICKS):
+            self.far.restart()
+            self.run(1)
+        self.far.restart()
+        return self.run(ticks, Request.STAND)
+
     def stand(self):
         """Enable the motors of a robot that stands already, and hold."""
-        self.run(3)
-        self.run(6, Request.STAND)
+        self.enable()
         self.runtime._enter(State.HOLD)
         self.run(48)
 

@@ -10,6 +10,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
+from jumper_warp.bench.bundle import export_bundle
 from jumper_warp.bench.vectors import record_vectors
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.check import check_bundle
@@ -116,6 +117,11 @@ def test_swapped_onnx_file_is_refused(bundle_folder, tmp_path):
     shutil.copy(folder / "walking.onnx", folder / "vertical_jump.onnx")
     with pytest.raises(InputError, match="differs from its hash"):
         Bundle(folder)
+
+
+def test_policy_with_an_observation_that_the_runtime_lacks_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot compute the observation block_ahead"):
+        export_bundle([("sighted_jump", load_policy("sighted_jump"))], tmp_path)
 
 
 def test_metadata_gives_other_readers_the_observation(bundle_folder):

@@ -2,9 +2,11 @@
 
 import errno
 import json
+import os
 import shutil
 import socket
 import threading
+import time
 
 import can
 import numpy as np
@@ -15,7 +17,8 @@ from jumper_warp.deploy import bus, main
 from jumper_warp.deploy.bundle import FILE, Bundle
 from jumper_warp.deploy.check import check_bundle
 from jumper_warp.deploy.log import read_log
-from jumper_warp.deploy.runtime import TICK
+from jumper_warp.deploy.operator import JOYSTICK, Keyboard
+from jumper_warp.deploy.runtime import TICK, Request
 from jumper_warp.utils.errors import InputError
 
 
@@ -120,9 +123,26 @@ def test_run_in_lockstep_without_a_time_ends_with_its_far_end(bundle_folder, sil
 
 def test_reason_for_motors_that_stay_off_is_printed(bundle_folder, silent_robot, capsys):
     """No motor replies, so that the request to stand is refused."""
-    ticks = 300 + 480 + 4  # of the run, and of its end
-    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(300 / 480)])
+    ticks = 400 + 960 + 4  # of the run, and of its end
+    main.main([str(bundle_folder), "--bus", silent_robot(ticks), "--demo", "--lockstep", "--seconds", str(400 / 480)])
     assert capsys.readouterr().out.splitlines() == ["PASSIVE SILENT"]
+
+
+def test_runtime_that_ends_brakes_for_2_s_without_its_watchdog(bundle_folder, tmp_path, monkeypatch):
+    """A beat each tick keeps the watchdog from braking."""
+    beats = []
+
+    class Counted(main.Watchdog):
+        """Watchdog whose beats are recorded."""
+
+        def beat(self):
+            """Record the time of a beat."""
+            beats.append(time.monotonic())
+            super().beat()
+
+    monkeypatch.setattr(main, "Watchdog", Counted)
+    main.main([str(bundle_folder), "--bus", f"unix:{tmp_path}/bus", "--demo", "--seconds", "0.1"])
+    assert len(beats) > 2 * 480 and beats[-1] - beats[0] > 2.0  # [s]
 
 
 def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp_path, monkeypatch, capsys):
@@ -145,12 +165,19 @@ def test_full_disk_ends_the_log_and_not_the_run(bundle_folder, silent_robot, tmp
             """Do nothing."""
 
     monkeypatch.setattr(can, "Logger", Full)
-    ticks = 300 + 480 + 4  # of the run, and of its end
-    args = ["--demo", "--lockstep", "--seconds", str(300 / 480), "--log", str(tmp_path / "log")]
+    ticks = 400 + 960 + 4  # of the run, and of its end
+    args = ["--demo", "--lockstep", "--seconds", str(400 / 480), "--log", str(tmp_path / "log")]
     main.main([str(bundle_folder), "--bus", silent_robot(ticks), *args])
     printed = capsys.readouterr()
     assert printed.out.splitlines() == ["PASSIVE SILENT"]
     assert printed.err.count("the log ends, the robot continues") == 1 and len(written) == 3
+
+
+def test_gamepad_stops_the_robot_when_the_standard_input_is_at_its_end(tmp_path, monkeypatch):
+    (tmp_path / "pad").write_bytes(JOYSTICK.pack(0, 1, 1, 1))  # button 1 is pressed
+    with open(os.devnull) as empty:
+        monkeypatch.setattr("sys.stdin", empty)
+        assert Keyboard(0.7, (0.5, 0.0), str(tmp_path / "pad")).poll()[0] == Request.STOP
 
 
 ABOUT = {"version": 1, "rate": 480, "capture": False, "tick_bytes": TICK.itemsize}

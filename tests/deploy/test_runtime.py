@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from jumper_warp.bench.bus_sim import BusFaults
+from jumper_warp.bench.logs import motions_of_log
 from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.log import Log, read_log, replay
 from jumper_warp.deploy.motions import joint_test
 from jumper_warp.deploy.runtime import Request, State
+from jumper_warp.deploy.safety import Fault
+from jumper_warp.utils.errors import InputError
 
 
 def run_until(robot, state, ticks=4000):
@@ -28,7 +31,7 @@ def test_walk_and_jump_to_a_place_replay_bit_for_bit(make_robot, bundle, tmp_pat
     robot = make_robot()
     robot.runtime.listener = log.tick
     robot.link.listener = log.frame
-    robot.run(3)
+    robot.run(360)
     assert robot.runtime.state == State.PASSIVE and not robot.far.enabled.any()
     robot.run(150, Request.STAND)
     assert robot.runtime.state == State.STAND_UP and robot.far.enabled.all()
@@ -70,6 +73,21 @@ def test_jump_up_over_the_bus_reaches_its_height(faults, tolerance, make_robot):
     assert robot.runtime.state == State.WALK and robot.far.q[2] > 0.2
 
 
+def test_motors_stay_off_until_the_robot_has_been_at_rest(make_robot):
+    """Without motors the standing robot falls, and lies after 0.3 s."""
+    robot = make_robot(BusFaults(gyro_noise=0.02, accel_noise=0.2), Estimator())
+    robot.run(60)
+    robot.run(60, Request.STAND)
+    assert robot.runtime.state == State.PASSIVE and robot.runtime.reason == Fault.MOVING
+    robot.run(240)
+    robot.run(30, Request.STAND)
+    assert robot.runtime.state == State.STAND_UP and robot.runtime.reason == Fault.NONE
+    assert robot.runtime.estimate.position[2] == pytest.approx(robot.far.q[2], abs=0.03)  # [m]
+    robot.run(1, Request.PASSIVE)
+    robot.run(1, Request.STAND)
+    assert robot.runtime.reason == Fault.MOVING  # earlier readings do not count
+
+
 def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
     """With one frame each, 0.9^12 = 28 % of robots would have all motors on."""
     for seed in range(5):
@@ -80,12 +98,36 @@ def test_every_motor_is_switched_on_although_frames_are_lost(make_robot):
         assert robot.far.enabled.all()
 
 
-def test_dry_run_keeps_the_motors_off(make_robot):
+def test_dry_run_keeps_the_motors_off_and_its_log_replays(make_robot, bundle, tmp_path):
     robot = make_robot(dry_run=True)
-    robot.run(3)
-    records = robot.run(50, Request.STAND)
+    log = Log(tmp_path / "log", bundle, 480, capture=True, dry_run=True)
+    robot.runtime.listener = log.tick
+    records = robot.enable(50)
     assert robot.runtime.state == State.STAND_UP
     assert not robot.far.enabled.any() and (records[-1]["sent"] == robot.runtime.off).all()
+    log.close()
+    assert replay(tmp_path / "log", bundle)[1] == -1
+    with pytest.raises(InputError, match="dry run"):
+        motions_of_log(tmp_path / "log")
+
+
+def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_path):
+    """While the robot waits for the confirmation, it only damps."""
+    robot = make_robot()
+    log = Log(tmp_path / "log", bundle, 480, capture=True)
+    robot.runtime.listener = log.tick
+    robot.enable(480)
+    robot.run(360, Request.CONFIRM)
+    log.close()
+    (motion,) = motions_of_log(tmp_path / "log")
+    assert len(motion.time) == 360 - 1 and (motion.base, motion.gains, motion.torque_limit) == ("free", "jumping", 18.0)
+    given = {"base": "fixed", "gains": "walking", "torque_limit": 12.0}
+    (motion,) = motions_of_log(tmp_path / "log", **given)
+    assert {name: getattr(motion, name) for name in given} == given
+    ticks = read_log(tmp_path / "log")[0]
+    sent = np.array([bundle.joints.codec.decode_command(frames)[2] for frames in ticks["sent"][1:]])
+    entered = (ticks["sent"][1:, :, :7] == 0xFF).all(axis=(1, 2))  # frames that switch motors
+    assert sent[~entered] == pytest.approx(ticks["kp"][:-1][~entered], abs=0.1)
 
 
 def test_zeroing_makes_the_angle_of_one_joint_its_offset(make_robot):
@@ -130,3 +172,18 @@ def test_policy_acts_every_eighth_or_ninth_tick_at_500_hz(make_robot):
     for tick in range(100):  # noqa: B007
         robot.run(1)
     assert set(np.diff(acted)) == {8, 9} and len(acted) == 12
+
+
+def test_skill_begins_at_rest_for_0_3_s_with_the_action_of_the_present_targets(make_robot, bundle):
+    robot = make_robot()
+    robot.stand()
+    motion = robot.runtime.motion
+    motion.stood = 0.0
+    rests = [robot.run(1) and motion.at_rest for _ in range(200)]
+    assert rests.index(True) == pytest.approx(144, abs=2)  # ticks
+    target = bundle.default + np.float32(0.1)
+    for state, speed in ((State.WALK, None), (State.JUMP_UP, 0.75), (State.JUMP_TO, 0.25)):
+        skill = robot.runtime.skills[state]
+        skill.begin(np.zeros(3), motion, target)
+        assert skill.policy.default + skill.policy.scale * skill.policy.action == pytest.approx(target)
+        assert speed is None or skill.phase._takeoff_speed == speed  # [m/s]

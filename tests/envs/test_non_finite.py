@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.evaluation.commands import DumpCfg, play_dump
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import load_overlay
+from jumper_warp.sim import simulation
 from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
 from jumper_warp.utils.dumps import load_dump, write_dump
 from jumper_warp.utils.errors import InputError
@@ -125,12 +128,13 @@ def test_a_metric_of_the_state_counts_a_value_that_is_not_finite_as_0():
     assert env.metrics()["Metrics/error_at_end_rad"] == pytest.approx(0.25 * (N - 1) / N)
 
 
-def test_dump_is_read_and_played(tmp_path, capsys):
+def test_dump_is_read_and_played(tmp_path, capsys, monkeypatch):
     env = make_env(N, task=faulty_task(), reset=only("default"))
     lift(env, 7)
     env.step(REST)
+    heavy = load_overlay(Path("heavy"))
     path, found = tmp_path / "non_finite" / "below.npz", env.non_finite()[0]
-    write_dump(path, found, iteration=3, task="jump", config={"train": {"seed": 11}})
+    write_dump(path, found, iteration=3, task="jump", config={"train": {"seed": 11}, "env": {"robot": heavy.to_json()}})
     read, header = load_dump(path)
     assert str(read) == str(found) and header["iteration"] == 3
     for name, values in found.arrays.items():
@@ -139,7 +143,11 @@ def test_dump_is_read_and_played(tmp_path, capsys):
     damaged.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"damaged.npz"):
         load_dump(damaged)
+    drawn = []
+    kind = simulation.Simulation
+    monkeypatch.setattr(simulation, "Simulation", lambda *a, **k: drawn.append(kind(*a, **k)) or drawn[0])
     recording = play_dump(DumpCfg(path, out=tmp_path / "film"))
+    assert float(drawn[0].model.body_mass.numpy().sum()) == pytest.approx(40.0, abs=0.1)  # [kg] of `heavy`
     assert recording.is_file() and recording.with_suffix(".png").is_file()
     printed = capsys.readouterr().out
     assert f"jump, iteration 3, seed 11: {found}" in printed and "rewards that are not finite: below" in printed

@@ -1,18 +1,21 @@
 """Conditions of evaluations: terminations, pushes, latency, gains and friction."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation.conditions import Conditions
+from jumper_warp.evaluation.conditions import Conditions, shared_robot
 from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.policy import save_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.tasks.jump.evaluation import with_jump_terminations
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg
 from landing_helpers import still_policy
@@ -100,6 +103,12 @@ def test_conditions_change_only_the_fixed_parameters():
     changed = (table != before).any(axis=1)
     assert changed.sum() == 8 and (table[changed] == np.float32(0.4)).all()  # static, dynamic friction of four legs
     assert not env.parameters.push.numpy().any()
+
+
+def test_policies_of_different_robot_folders_are_not_combined():
+    robots = {name: load_overlay(Path(name)) for name in ("heavy", "small_direct_drive")}
+    with pytest.raises(PolicyError, match="heavy and small_direct_drive were trained with different robots"):
+        shared_robot(robots, Conditions())
 
 
 def test_sensor_offset_is_drawn_for_every_robot_and_motor_within_its_size():

@@ -1,12 +1,16 @@
 """A driven robot: velocities, jumps to clicked places, physical values, pushes, grounds, and other tasks."""
 
 from dataclasses import astuple
+from queue import SimpleQueue
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drive_helpers import session_of
+from jumper_warp.evaluation.conditions import Conditions
 from jumper_warp.evaluation.skills import SkillNames
+from jumper_warp.live.page import Page
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +89,25 @@ def test_values_of_the_driver_outlast_a_reset(session):
     parameters = session.env.parameters
     assert parameters.latency.numpy()[0] == 5  # physics steps of 1/480 s
     assert parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()] == pytest.approx(0.2)
+
+
+def test_other_values_of_the_conditions_stay_when_the_driver_changes_one():
+    session = session_of("vertical_jump", conditions=Conditions(device="cpu", threads=1, friction=0.3, latency=10.0))
+    assert session.nominal["friction [1]"] == pytest.approx(0.3)
+    session.set_value("payload [kg]", 1.0)
+    parameters = session.env.parameters
+    assert parameters.latency.numpy()[0] == 5  # physics steps of 1/480 s
+    assert parameters.shape_mu.numpy()[parameters.paw_shapes.numpy()] == pytest.approx(0.3)
+
+
+def test_command_that_is_refused_is_shown_and_the_page_continues():
+    session = session_of("attitude", agent="hold")
+    page, shown = SimpleNamespace(session=session, requests=SimpleQueue(), stopped=False, visitors={}, speed=1.0), []
+    page.notify = lambda title, text: shown.append(text)
+    page.requests.put(lambda: session.env.command([0.0] * 4))
+    page.requests.put(lambda: setattr(page, "stopped", True))
+    Page.run(page)
+    assert len(shown) == 1
 
 
 def test_friction_changes_a_landing(session):
