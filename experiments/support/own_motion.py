@@ -40,7 +40,7 @@ class Record:
 
     q: list[np.ndarray] = field(default_factory=list)  # (19, n) as in `Trajectory`
     qd: list[np.ndarray] = field(default_factory=list)  # (18, n)
-    initial_target: list[np.ndarray] = field(default_factory=list)  # (12, n) [rad]
+    initial_target: list[np.ndarray] = field(default_factory=list)  # (steps, 12, n) [rad]
     target: list[np.ndarray] = field(default_factory=list)  # (12, n) [rad] before the command filter
     running: list[np.ndarray] = field(default_factory=list)  # (n,) whether the robot has not failed before
 
@@ -144,7 +144,7 @@ def identify(record: Record, nominal: Env, rng: np.random.Generator | None = Non
 
     def at(rows: list[np.ndarray], later: int = 0) -> np.ndarray:
         """Return recorded arrays of all robots' windows, (values, robots * windows)."""
-        return np.stack([rows[i + later] for i in first], axis=-1).reshape(len(rows[0]), -1)
+        return np.stack([rows[i + later] for i in first], axis=-1).reshape(*rows[0].shape[:-1], -1)
 
     q, qd, initial_target = (at(rows) for rows in (record.q, record.qd, record.initial_target))
     targets = np.stack([at(record.target, i) for i in range(WINDOW)])

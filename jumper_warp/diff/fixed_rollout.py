@@ -32,14 +32,15 @@ class FixedRollout(Rollout):
         vec3 = modules.scalar.vec3
         commands = modules.trajectory.Commands()
         commands.target, commands.wrench = self._zeros(most, 12, n), self._zeros(most, 6, n)
-        commands.initial_target, commands.impulse = self._zeros(12, n), self._zeros(4, n, dtype=vec3)
+        earlier = (self.targets_kept, 12)
+        commands.initial_target, commands.impulse = self._zeros(*earlier, n), self._zeros(4, n, dtype=vec3)
         rows = self._rows(most)
         cotangents = modules.trajectory.TrajectoryArrays()
         cotangents.q, cotangents.qd = wp.zeros_like(rows.q), wp.zeros_like(rows.qd)
         for name, dtype in (("torque", self.real), ("impulse", vec3), ("pressed", wp.uint8)):
             setattr(cotangents, name, self._zeros(0, 0, 0, dtype=dtype))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (most, 12), "initial_target": (12,), "wrench": (most, 6),
+        shapes = {"q": (19,), "qd": (18,), "target": (most, 12), "initial_target": earlier, "wrench": (most, 6),
                   "filtered_target": (most, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
@@ -64,7 +65,8 @@ class FixedRollout(Rollout):
         count = len(targets)
         self._timed = self._timing(count)
         target, initial = self._commanded
-        for into, values in ((target[:count], targets), (initial, initial_target), (self.q[0], q), (self.qd[0], qd)):
+        earlier = initial_target.reshape(-1, 12, self.num_worlds)[-len(initial) :]
+        for into, values in ((target[:count], targets), (initial, earlier), (self.q[0], q), (self.qd[0], qd)):
             into.copy_(torch.from_numpy(values))
         modules = self.dynamics.modules
         inputs, outputs = self._forward

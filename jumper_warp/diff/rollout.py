@@ -10,12 +10,14 @@ forward and reverse pass (`run`, `backward`); arrays and launches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import ArrayLike
 
@@ -71,12 +73,14 @@ class Trajectory:
     """(T S, 4, num_worlds) Bit sets of each leg's pressed hard stops, see `jumper_warp.kernels.actuation.stops`."""
     filtered_target: wp.array  # (T, 12, num_worlds) [rad] Targets after the command filter
     commands: KernelStruct  # The kernels' `Commands` of the rollout
+    kept: int  # Number of filtered targets that may still act after the end
     from_start: bool = False
     """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
     def end(self) -> dict[str, Any]:
         """Return the final state as arguments with which `Rollout.run` continues: q, qd, initial_target, impulse."""
-        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
+        past = [wp.to_torch(array) for array in (self.commands.initial_target, self.filtered_target)]
+        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": wp.from_torch(torch.cat(past)[-self.kept :])}
         return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 
 
@@ -91,7 +95,7 @@ class Rollout(Uncopied):
         model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
         motors: By default the jumping gains at 18 N m.
         command_filter: Filter of motor targets; None: the targets are not filtered.
-        description: Robot description of the model, by default the project's; worlds take several in turn.
+        description: Robot description, by default that of `build_model`; worlds take several in turn.
         double: Whether to compute in double precision.
         dt: Physics step [s].
         substeps: Physics steps in a policy step.
@@ -136,6 +140,8 @@ class Rollout(Uncopied):
         self.dt = dt
         self.substeps = substeps
         self.every = every
+        self.targets_kept = 1 + math.ceil(LATENCY_RANGE[1] / (dt * substeps))
+        """Number of filtered targets that may still act after a policy step."""
         self._actuation = self._make_actuation(jumping_motors() if motors is None else motors, command_filter)
         self.motors = self._actuation.motors  # The kernels' `MotorArrays`, whose arrays are among the parameters
         self.parameters: dict[str, wp.array] = {
@@ -247,8 +253,9 @@ class Rollout(Uncopied):
             targets: Motor targets before the command filter [rad], (T, 12, num_worlds).
             q: Initial coordinates, (19, num_worlds), as in `Trajectory.q`.
             qd: Initial rates, (18, num_worlds), as in `Trajectory.qd`.
-            initial_target: Filtered targets [rad] in use until the first target arrives, (12, num_worlds); matters with
-                a latency. By default the initial angles; the gradient w.r.t. q then includes this one.
+            initial_target: Filtered targets [rad] of earlier policy steps, the latest one last, (steps, 12, num_worlds)
+                or (12, num_worlds), in use until the first target arrives; matters with a latency. The first one
+                stands for all before. By default the initial angles; the gradient w.r.t. q then includes this one.
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
             impulse: Contact impulses of the previous physics step, as in `Trajectory.impulse`, (4, num_worlds) vec3; by
@@ -267,8 +274,9 @@ class Rollout(Uncopied):
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        initial = q[7:] if initial_target is None else self._input("initial_target", initial_target, (12,))
-        commands.initial_target = initial
+        initial: Any = q[7:] if initial_target is None else initial_target
+        shape = (len(initial), 12) if np.ndim(initial) == 3 else (12,)
+        commands.initial_target = self._input("initial_target", initial, shape).reshape((-1, 12, self.num_worlds))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
@@ -291,7 +299,8 @@ class Rollout(Uncopied):
         else:
             self._launch(modules.rollout.rollout_kernel, inputs, [self.dynamics.work, filtered_target, rows])
         arrays = (rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, filtered_target)
-        return Trajectory(*arrays, commands, from_start=initial_target is None)
+        kept = max(self.targets_kept, len(commands.initial_target))
+        return Trajectory(*arrays, commands, kept, from_start=initial_target is None)
 
     @locked
     def backward(
@@ -309,7 +318,7 @@ class Rollout(Uncopied):
         q, qd, torque, impulse, filtered_target: cotangents, the gradients of the loss w.r.t. these arrays of
         `trajectory`, of the same shapes and types; None: zero. The parameters must be those of the forward pass.
 
-        Returned by name, worlds last: targets, q, qd (initial rows), initial_target, wrench, the entries of
+        Returned by name, worlds last: targets, q, qd (initial rows), initial_target (steps, 12), wrench, the entries of
         `parameters`, and `geometry` (4, 10, num_worlds) w.r.t. the legs' lengths. The gradient w.r.t. the initial
         quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
@@ -327,7 +336,8 @@ class Rollout(Uncopied):
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,), "wrench": (count, 6),
+        earlier = (len(commands.initial_target), 12)
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": earlier, "wrench": (count, 6),
                   "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
@@ -347,7 +357,7 @@ class Rollout(Uncopied):
                 self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, cotangents], [self._record, gradients])
         if trajectory.from_start:
-            wp.map(wp.add, gradients.q[7:], gradients.initial_target, out=gradients.q[7:])
+            wp.map(wp.add, gradients.q[7:], gradients.initial_target[0], out=gradients.q[7:])
         by_inputs = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "wrench": gradients.wrench}
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 

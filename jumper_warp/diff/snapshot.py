@@ -32,7 +32,7 @@ class Snapshot(NamedTuple):
     q: torch.Tensor
     """(19, num_worlds) Base origin [m], xyzw, motor angles [rad], as in `jumper_warp.diff.rollout.Trajectory`."""
     qd: torch.Tensor  # (18, num_worlds) Velocity of the base's COM [m/s], angular velocity and motor rates [rad/s]
-    initial_target: torch.Tensor  # (12, num_worlds) [rad] Filtered targets of the last policy step
+    initial_target: torch.Tensor  # (steps, 12, num_worlds) [rad] Filtered targets of the last policy steps
     impulse: torch.Tensor  # (4, num_worlds, 3) [N s] Contact impulses in the last physics step, world axes
     action: torch.Tensor  # (12, num_worlds) Actions of the last policy step, within ±1
     torque: torch.Tensor  # (12, num_worlds) [N m] Motor torques in the last physics step

@@ -31,10 +31,11 @@ class TorchTrajectory(NamedTuple):
     torque: torch.Tensor  # (T S, 12, num_worlds) [N m] motor torques
     impulse: torch.Tensor  # (T S, 4, num_worlds, 3) [N s] on the paws, world frame; force: over the physics step
     filtered_target: torch.Tensor  # (T, 12, num_worlds) [rad] targets after the command filter
+    last_targets: torch.Tensor  # (steps, 12, num_worlds) [rad] the last of them and, with a latency, of those before
 
     def end(self) -> dict[str, torch.Tensor]:
         """Return the final state as arguments with which `simulate` continues; `impulse` has no gradient."""
-        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
+        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.last_targets}
         return state | {"impulse": self.impulse[-1].detach()}
 
 
@@ -84,7 +85,8 @@ def simulate(
             f"a rollout has no parameter {unknown!r:.60}; it has {', '.join(rollout.parameters)}, geometry"
         )
     shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "wrench": (len(targets), 6)}
-    shapes |= {"initial_target": (12,), "geometry": (4, 10)}
+    initial = q[7:] if initial_target is None else initial_target
+    shapes |= {"initial_target": (len(initial), 12) if initial.dim() == 3 else (12,), "geometry": (4, 10)}
     shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
     real = torch.float64 if rollout.real is wp.float64 else torch.float32
     for name, tensor in given.items():
@@ -95,14 +97,16 @@ def simulate(
         if tuple(tensor.shape) != full:
             raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
         given[name] = tensor.to(dtype=real).contiguous()
-    given.setdefault("initial_target", given["q"][7:].contiguous())
+    given["initial_target"] = given.get("initial_target", given["q"][7:]).reshape(-1, 12, rollout.num_worlds)
     if impulse is not None:
         if tuple(impulse.shape) != (4, rollout.num_worlds, 3):
             raise InputError(f"impulse must have shape {(4, rollout.num_worlds, 3)}, got {tuple(impulse.shape)}")
         impulse = impulse.detach().to(dtype=real).contiguous()
     if not trusted:
         _check_numbers(given if impulse is None else given | {"impulse": impulse})
-    return TorchTrajectory(*_Simulate.apply(rollout, tuple(given), impulse, *given.values()))
+    *outputs, filtered = _Simulate.apply(rollout, tuple(given), impulse, *given.values())
+    kept = max(rollout.targets_kept, len(given["initial_target"]))
+    return TorchTrajectory._make((*outputs, filtered, torch.cat([given["initial_target"], filtered])[-kept:]))
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:

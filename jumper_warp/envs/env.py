@@ -410,14 +410,12 @@ class Env(Stages):
 
     @locked
     def snapshot(self) -> Snapshot:
-        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device.
-
-        Targets are saved in a ring by policy step; that of the last step acts until the next one arrives.
-        """
+        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
         sim = self.sim
         n = self.num_envs
-        past = wp.to_torch(self.delays.target_history)
-        step_count = wp.to_torch(self.episodes.step_count).long()
+        past = wp.to_torch(self.delays.target_history)  # ring by policy step
+        age = torch.arange(len(past), 0, -1, device=self.device)
+        row = (wp.to_torch(self.episodes.step_count).long() - age[:, None]) % len(past)
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
         dynamics = sim.dynamics
         return Snapshot(
@@ -433,7 +431,7 @@ class Env(Stages):
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
             q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
             qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
-            initial_target=past[(step_count - 1) % len(past), :, torch.arange(n, device=self.device)].T,
+            initial_target=past[row, :, torch.arange(n, device=self.device)].mT,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
             torque=wp.to_torch(self.robot.torque),

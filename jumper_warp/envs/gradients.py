@@ -33,7 +33,7 @@ class LoopState(NamedTuple):
 
     q: torch.Tensor  # (19, num_worlds) base origin [m], orientation xyzw, motor angles [rad]
     qd: torch.Tensor  # (18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
-    initial_target: torch.Tensor  # (12, num_worlds) [rad] filtered targets of the last policy step
+    initial_target: torch.Tensor  # (steps, 12, num_worlds) [rad] filtered targets of the last policy steps
     impulse: torch.Tensor  # (4, num_worlds, 3) [N s] contact impulses in the last physics step; has no gradient
     action: torch.Tensor  # (12, num_worlds) actions of the last policy step, within ±1
     prev_action: torch.Tensor  # (12, num_worlds) actions of the policy step before
@@ -272,7 +272,7 @@ class EnvGradients:
         force = trajectory.impulse / self.rollout.dt
         return StepInputs(
             end.q, end.qd, end.torque, force[-1], force.norm(dim=-1).amax(0), end.action, before.action,
-            before.prev_action, targets, end.initial_target, before.qd[6:],
+            before.prev_action, targets, end.initial_target[-1], before.qd[6:],
             origin_velocity(before.q, before.qd, com), before.torque,
         )  # fmt: skip
 

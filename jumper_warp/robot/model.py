@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 import newton
 import numpy as np
@@ -106,7 +106,8 @@ def build_model(
         extras(one)
     builder.replicate(one, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
     _add_ground(builder, ground)
-    model = cast(Model, builder.finalize(device=device))
+    model: Any = builder.finalize(device=device)
+    model.robot_descriptions = descriptions  # for `JumperDynamics`
     if len(descriptions) > 1:
         _write_robots(model, descriptions)
     if robot is not None:

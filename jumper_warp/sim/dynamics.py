@@ -117,7 +117,7 @@ class JumperDynamics:
         `max_sweeps` below 1, or `tolerance` not finite and positive.
         """
         check_model(model)
-        robots = described_robots(description)
+        robots = described_robots(getattr(model, "robot_descriptions", None) if description is None else description)
         check_type("block", block, BlockCfg | None)
         max_sweeps = check_count("max_sweeps", max_sweeps)
         check_positive("tolerance", tolerance)

@@ -37,7 +37,7 @@ class Start(NamedTuple):
 
     q: np.ndarray  # (19, num_worlds) as in `Trajectory`: base origin [m], xyzw, motor angles [rad]
     qd: np.ndarray  # (18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
-    initial_target: np.ndarray  # (12, num_worlds) [rad] filtered targets of the last policy step
+    initial_target: np.ndarray  # (steps, 12, num_worlds) [rad] filtered targets of the last policy steps
     phase: np.ndarray  # (num_worlds,) STANCE, FLIGHT or LANDED
     apex: np.ndarray  # (num_worlds,) [m] largest height of the base in flight so far; 0 before
 

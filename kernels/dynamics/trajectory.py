@@ -27,6 +27,9 @@ FILTER_SPEED = wp.constant(13)  # speed floor [rad/s]
 FILTER_ROWS = wp.constant(14)
 
 
+EARLIEST = wp.constant(1000000)  # policy steps before the first, beyond any latency
+
+
 @wp.struct
 class Timing:
     """Numbers of policy and physics steps of a rollout, and of physics steps between recorded rows."""
@@ -52,7 +55,7 @@ class Commands:
     """Inputs of a rollout of T policy steps: motor targets, wrenches on the base and the paws' initial impulses."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
-    initial_target: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the first target arrives
+    initial_target: wp.array3d(dtype=real)  # [rad], (earlier policy steps, 12, num_worlds), the latest one last
     wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
 
@@ -166,7 +169,7 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 class Arrival:
     """Indices and weight of the two delayed policy targets between which a motor's target is interpolated."""
 
-    older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
+    older: int  # policy step of the target at the start of the physics step; below 0: `Commands.initial_target`
     newer: int  # policy step of the target at the end of the physics step
     weight: real  # of the newer target, in (0, 1]; the older one has 1 - weight
 
@@ -182,8 +185,8 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
     begin = real(step) - delay
     size = real(substeps)
     a = Arrival()
-    a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -1, step / substeps)
-    a.newer = wp.clamp(int(wp.ceil((begin + real(1.0)) / size)) - 1, -1, step / substeps)
+    a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -EARLIEST, step / substeps)
+    a.newer = wp.clamp(int(wp.ceil((begin + real(1.0)) / size)) - 1, -EARLIEST, step / substeps)
     a.weight = real(1.0)
     if a.newer > a.older:
         a.weight = begin + real(1.0) - real(a.newer) * size
@@ -192,11 +195,14 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 
 @wp.func
 def policy_target(
-    filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
+    filtered_target: wp.array3d(dtype=real), initial_target: wp.array3d(dtype=real), step: int, motor: int, world: int
 ) -> real:
-    """Return the filtered target [rad] of motor 0 to 11 in policy step `step`, or the initial target if step < 0."""
+    """Return the filtered target [rad] of motor 0 to 11 in policy step `step`, or an initial target if step < 0.
+
+    The first initial target stands for all earlier ones.
+    """
     if step < 0:
-        return initial_target[motor, world]
+        return initial_target[wp.max(initial_target.shape[0] + step, 0), motor, world]
     return filtered_target[step, motor, world]
 
 

@@ -16,6 +16,7 @@ from jumper_warp.envs.gradients import EnvGradients
 from jumper_warp.kernels.mdp.rewards import root
 from jumper_warp.policies.policy import Policy
 from jumper_warp.registry import make_task
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 from jumper_warp.utils.errors import InputError
 
@@ -59,11 +60,27 @@ def test_values_are_bitwise_those_of_steps_without_gradients(name):
             # [m] and [rad], [rad], [1], [m/s] and [rad/s], [N m]
             tolerances = {"q": 1.0e-4, "initial_target": 1.0e-6, "action": 0.0, "qd": 2.0e-2, "torque": 5.0e-2}
             for part, atol in tolerances.items():
-                parts = (getattr(state, part)[:, running] for state in (gradients.simulated, gradients.state))
+                parts = (getattr(state, part)[..., running] for state in (gradients.simulated, gradients.state))
                 torch.testing.assert_close(*parts, rtol=0.0, atol=atol, msg=part)
     env.load_state_dict(start)
     for (reward, _), step in zip(plain, steps_of(env, 2, act), strict=False):
         assert torch.equal(step.reward, reward) and not step.reward.requires_grad
+
+
+@pytest.mark.parametrize("robot", ["heavy", "long_jumper"])
+def test_rollout_of_another_robot_is_that_of_its_environment(robot):
+    """With latencies of 20 to 32 ms, targets of two policy steps before still act."""
+    overlay = RobotOverlay({}, {"latency": (20.0, 32.0)}, robot=load_overlay(robot).robot)
+    env = Env(make_task("velocity-flat", overlay), 6, seed=3, device="cpu", robot=overlay)
+    env.reset()
+    actions = torch.from_numpy(np.random.default_rng(0).uniform(-0.5, 0.5, (6, 6, 12))).float()
+    with env.gradients() as gradients:
+        for action in actions:
+            env.step(action)
+            for part, atol in {"q": 1.0e-4, "qd": 5.0e-2}.items():
+                parts = (getattr(state, part) for state in (gradients.simulated, gradients.state))
+                torch.testing.assert_close(*parts, rtol=0.0, atol=atol, msg=part)
+    assert not env.done.any()
 
 
 @pytest.mark.parametrize("name", POLICIES)

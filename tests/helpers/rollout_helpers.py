@@ -95,6 +95,7 @@ def gradients(of: Rollout, values: dict[str, np.ndarray], by: dict[str, np.ndarr
     by = weights(trajectory) if by is None else by
     cotangents = {name: (of.vectors if name == "impulse" else of.array)(weight) for name, weight in by.items()}
     by_inputs = of.backward(trajectory, **cotangents)
+    by_inputs["initial_target"] = by_inputs["initial_target"][-1]  # the latest of several
     return by, {name: array.numpy()[..., 0].astype(float).copy() for name, array in by_inputs.items()}
 
 

@@ -44,12 +44,13 @@ class FilterAdjoint:
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
     """Add a number to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
 
-    A motor follows a target in several physics steps, and each of these adds its part. step: policy step; -1 for the
-    initial target, which a motor follows until the first target arrives.
+    A motor follows a target in several physics steps, and each of these adds its part. step: policy step; below 0 for
+    the initial targets, see `policy_target`.
     """
     if step < 0:
         # atomic to avoid a load: no other thread writes here
-        wp.atomic_add(gradients.initial_target, motor, world, gradient)
+        earlier = wp.max(gradients.initial_target.shape[0] + step, 0)
+        wp.atomic_add(gradients.initial_target, earlier, motor, world, gradient)
     else:
         wp.atomic_add(gradients.filtered_target, step, motor, world, gradient)
 

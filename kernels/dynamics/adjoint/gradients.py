@@ -45,7 +45,7 @@ class Gradients:
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
     target: wp.array3d(dtype=real)  # (T, 12, num_worlds)
-    initial_target: wp.array2d(dtype=real)  # (12, num_worlds); the caller must zero it first
+    initial_target: wp.array3d(dtype=real)  # of `Commands.initial_target`; the caller must zero it first
     wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds); the caller must zero it first
     filtered_target: wp.array3d(dtype=real)  # (T, 12, num_worlds); the caller must zero it first
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
