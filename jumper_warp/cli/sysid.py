@@ -1,4 +1,4 @@
-"""`jumper sysid`: identify the robot's parameters from recorded motions, plan such motions, or identify one motor."""
+"""`jumper sysid`: identify the robot's parameters from recorded motions, or plan such motions."""
 
 from __future__ import annotations
 
@@ -116,13 +116,16 @@ def sysid(cfg: SysidCfg) -> None:
     """
     from jumper_warp.identification.identify import identify
     from jumper_warp.identification.report import write_results
-    from jumper_warp.robot.overlay import load_overlay
+    from jumper_warp.robot.overlay import LENGTHS, load_overlay
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    robot = load_overlay(cfg.robot).description
+    overlay = load_overlay(cfg.robot)
+    if overlay.values.keys() - LENGTHS.keys():
+        raise InputError(f"a fit begins at the described values: give the robot's folder, not the overlay {cfg.robot}")
+    robot = overlay.description
     parameters = jumper_parameters(split_names(cfg.params), robot).without(split_names(cfg.exclude))
     settings: Json = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["description"] = robot

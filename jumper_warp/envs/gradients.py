@@ -337,6 +337,7 @@ class _Terms(torch.autograd.Function):
         ctx.gradients = gradients
         ctx.arrays = arrays
         ctx.kept = kept
+        ctx.numbers = wp.to_torch(gradients._skill.params.values).clone()  # `Env.set` may change them
         rewards, components = gradients.shape
         return inputs[0].new_zeros(rewards, len(kept)), inputs[0].new_zeros(components, len(kept))
 
@@ -347,7 +348,8 @@ class _Terms(torch.autograd.Function):
             raise InputError("an environment's steps have no second derivatives: create_graph must be False")
         n = len(ctx.kept)
         with WARP_LOCK:
-            by_arrays = ctx.gradients.reverse(ctx.arrays, *(torch.where(ctx.kept, grad, 0.0) for grad in grads))
+            kept = (torch.where(ctx.kept, grad, 0.0) for grad in grads)
+            by_arrays = ctx.gradients.reverse(ctx.arrays, *kept, numbers=ctx.numbers)
         by_inputs = []
         for name in StepInputs._fields:
             grad = wp.to_torch(by_arrays[name])

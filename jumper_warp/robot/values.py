@@ -86,8 +86,8 @@ def ratio(value: float, reference: float) -> float:
 def described(values: RobotValues, description: RobotDescription) -> RobotDescription:
     """Return a description with the masses, motors and knee damping of the first robot of `values`.
 
-    A motor joint's speed limit becomes the no-load speed, its effort limit is scaled by `saturation`. The URDF text is
-    kept. A description has no place for friction of the paws, sensor offsets and latency.
+    A motor joint's speed limit becomes the no-load speed, its effort limit is scaled by the lower of `saturation` and
+    `peak`. The URDF text is kept. A description has no place for friction of the paws, sensor offsets and latency.
     """
     base = description.links[0]
     ratios: dict[str, float] = dict(zip(LINK_KINDS, map(float, values.link_mass[0]), strict=True))
@@ -104,7 +104,7 @@ def described(values: RobotValues, description: RobotDescription) -> RobotDescri
         for quantity in ("kp", "kd", "saturation", "peak"):
             value[quantity] = ratio(value[quantity], float(getattr(nominal, quantity)[0, index]))
         motors.append(_described_motor(motor, value))
-        effort = value["saturation"] * joints[name].effort
+        effort = min(value["saturation"], value["peak"]) * joints[name].effort
         joints[name] = replace(joints[name], effort=effort, velocity=value["no_load_speed"])
     damping = float(values.knee_damping[0, 0])
     parts = {"links": tuple(links), "joints": tuple(joints.values()), "motors": tuple(motors)}

@@ -98,7 +98,7 @@ class Simulation(Uncopied):
 
     Args:
         solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
-        motors: By default the jumping gains at 18 N m.
+        motors: By default the Jumper's jumping gains at 18 N m; those of another robot: `motors_for`.
         command_filter: Motor command filter; None passes targets to the motors unchanged.
         ground: As in `build_model`.
         block: A block in each world that slides when the robot pushes it; on SolverJumper only.

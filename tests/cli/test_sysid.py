@@ -87,3 +87,9 @@ def test_refuses_a_folder_of_motions_given_twice(recorded, capsys):
     assert end.value.code == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "motions 1 (0_hung_chirp) and 5 (0_hung_chirp) are the same recording: give it once" in error
+
+
+def test_refuses_an_overlay_as_the_robot_of_a_fit(recorded, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", "fit", str(recorded / "motions"), *PARAMS, "--robot", str(recorded / "truth.json")])
+    assert end.value.code == 2 and "give the robot's folder, not the overlay" in capsys.readouterr().err

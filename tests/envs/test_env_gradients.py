@@ -215,6 +215,20 @@ def test_gradients_of_observations_match_differences(name):
     assert 0.97 < ((found * expected).sum(0) / expected.square().sum(0)).median() < 1.03
 
 
+def test_numbers_set_after_a_step_do_not_change_its_gradient():
+    gradients = []
+    for later in (False, True):
+        env = Env(make_task("vertical-jump"), 3, seed=1, device="cpu")
+        env.reset()
+        action = torch.zeros(3, 12, requires_grad=True)
+        with env.gradients():
+            reward = env.step(action).reward.sum()
+            if later:
+                env.set("rewards.joint_symmetry.weight", 0.0)
+            gradients.append(torch.autograd.grad(reward, action)[0])
+    assert torch.equal(*gradients) and gradients[0].any()
+
+
 def test_gradients_by_weights_of_each_world_sum_to_the_gradient_of_the_total():
     net = network("vertical-jump")
     env = Env(make_task("vertical-jump"), 3, seed=1, device="cpu")

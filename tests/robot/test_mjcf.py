@@ -139,7 +139,7 @@ def test_overlay_changes_masses_motors_friction_and_springs(tmp_path):
     nominal = RobotOverlay({}).robots()
     values = {
         "base_mass": (8.43,), "base_com": (0.01, 0.0, 0.0), "link_mass": (1.1, 1.0, 1.0, 1.0, 1.0),
-        "armature": tuple(2.0 * nominal.armature[0]), "kp": (0.5,) * 12, "saturation": (0.9,) * 12,
+        "armature": tuple(2.0 * nominal.armature[0]), "kp": (0.5,) * 12, "saturation": (0.9,) * 12, "peak": (0.8,) * 12,
         "knee_damping": (0.2,), "paw_friction": (0.6,), "spring_stiffness": (1000.0,), "spring_length": (0.17,),
     }  # fmt: skip
     model, data = load(export_robot("mjcf", tmp_path, RobotOverlay(values)))
@@ -147,7 +147,7 @@ def test_overlay_changes_masses_motors_friction_and_springs(tmp_path):
     np.testing.assert_allclose(model.body("body").ipos, [0.01, 0.0, 0.0])
     assert model.joint("FL_outer").armature[0] == pytest.approx(2.0 * 0.00414)
     assert model.actuator("FL_outer").gainprm[0] == pytest.approx(8.5)
-    np.testing.assert_allclose(model.actuator("FL_outer").forcerange, [-22.32, 22.32])
+    np.testing.assert_allclose(model.actuator("FL_outer").forcerange, [-19.84, 19.84])
     assert model.actuator("FL_outer_knee").gainprm[0] == pytest.approx(0.2)
     assert model.geom("FL_paw").friction[0] == pytest.approx(0.6)
     spring = model.tendon("FL_spring")
