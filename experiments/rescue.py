@@ -160,9 +160,7 @@ class Robots:
             rest = np.flatnonzero(ends != SUCCESS)
             if len(rest):
                 env = self.env(len(rest))
-                controller = self.controller(
-                    env, self.env(len(rest)), scales=scales, iterations=1, substeps=SUBSTEPS
-                )  # fmt: skip
+                controller = self.controller(env, self.env(len(rest)), scales=scales, iterations=1, substeps=SUBSTEPS)
                 controller.first_iterations = self.args.offline_iterations
                 ends[rest] = self.run(env, controller.act, goals[rest]).outcomes[:, 0]
         return ends

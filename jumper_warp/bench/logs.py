@@ -70,11 +70,14 @@ class LogCfg:
 def simulated_again(ticks: np.ndarray, rate: int) -> np.ndarray:
     """Return the joint coordinates (ticks, 43) of a simulation that gets a log's commands, from its first pose on.
 
-    It starts at rest. rate: ticks per second. A row is the state in which a tick's commands arrive.
+    It starts at rest, without an estimated position at the default height. rate: ticks per second. A row is the state
+    in which a tick's commands arrive.
     """
     far = BusSim([], sim=make_simulation(1.0 / rate))
     q = far.sim.joint_q()[0].copy()
-    q[:3], q[3:7], q[MOTORS] = ticks["position"][0], ticks["quaternion"][0], ticks["angle"][0]
+    q[3:7], q[MOTORS] = ticks["quaternion"][0], ticks["angle"][0]
+    if ticks["position"][0].any():  # else the height of the default pose
+        q[:3] = ticks["position"][0]
     far.sim.state.joint_q.assign(q)
     result = np.empty((len(ticks), len(q)), np.float32)
     for number, frames in enumerate(ticks["sent"]):
@@ -88,9 +91,11 @@ def simulated_again(ticks: np.ndarray, rate: int) -> np.ndarray:
 def play_log(cfg: LogCfg) -> Path:
     """Write the recording of a log and its simulation, print how far they differ, and return its path.
 
-    The first robot is the log, the second the simulation. Raises InputError: the log is damaged.
+    They begin at the log's first estimated position. The first robot is the log, the second the simulation. Raises
+    InputError: the log is damaged.
     """
     ticks, about = read_log(cfg.log)
+    ticks = ticks[ticks["position"].any(axis=1).argmax() :]  # from the first estimated position on
     rate = about["rate"]
     simulated = simulated_again(ticks, rate)
     sim = Simulation(2, motors=jumping_motors(), device="cpu")

@@ -104,10 +104,12 @@ def run(bundle: Bundle, options: argparse.Namespace) -> None:
 
     def tick(late: float) -> None:
         """Run a tick with the operator's request, and print changes of the state and of the fault that ended it."""
-        nonlocal last, replies
+        nonlocal last, replies, ticks
         count = next(ticks)
         count = count if count <= last_at else first + (count - first) % (last_at - first)
         record = runtime.tick(*(demo.get(count, NOTHING) if options.demo else operator.poll()), late=late)
+        if record["request"] == Request.STAND and runtime.state == State.PASSIVE:
+            ticks = itertools.count()  # the demo tries again
         replies += np.count_nonzero(record["received"]["motor_fresh"])
         if dog is not None:
             dog.beat()

@@ -73,9 +73,7 @@ class FixedRollout(Rollout):
         if self.by_legs:
             self._launch_legs(modules.rollout_legs.rollout_legs_kernel, [self._timed, *inputs], outputs)
         else:
-            self._launch(
-                modules.rollout.rollout_kernel, [self._timed, *inputs], [self.dynamics.work, *outputs]
-            )  # fmt: skip
+            self._launch(modules.rollout.rollout_kernel, [self._timed, *inputs], [self.dynamics.work, *outputs])
         return count * self.substeps // self.every + 1
 
     @locked

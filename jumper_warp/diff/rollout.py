@@ -46,9 +46,7 @@ MAX_SWEEPS = 200  # largest number of sweeps of the contact iteration in a physi
 TOLERANCE = 1.0e-6  # [m/s] of the contact iteration in single precision; gradients inherit its error
 TOLERANCE_DOUBLE = 1.0e-13  # [m/s] of the contact iteration in double precision
 LATENCY_RANGE = (0.0, 0.1)  # [s] Allowed values of `Rollout.parameters["latency"]`
-GEOMETRY_NAMES = (
-    "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
-)  # fmt: skip
+GEOMETRY_NAMES = ("hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius")
 """Lengths [m] of a leg, in the order of `Rollout.geometry`; see `jumper_warp.kernels.kinematics.geometry`."""
 
 

@@ -12,9 +12,7 @@ from jumper_warp.identification.parameters import Parameter, ParameterSet
 
 WEAK = 3.0
 """[1] Data over prior information below which a direction is undetermined: at 3 the std is half the prior's."""
-TORQUE_SCALE = (
-    "base_mass", "link_mass", "kp", "kd", "saturation", "armature", "motor_friction", "knee_damping",
-)  # fmt: skip
+TORQUE_SCALE = ("base_mass", "link_mass", "kp", "kd", "saturation", "armature", "motor_friction", "knee_damping")
 """Quantities of `RobotValues` that may all grow by the same factor without any effect on motor angles."""
 MAX_LAGS = 200  # Largest lag [rows] of the summed autocorrelations
 ADVICE = {

@@ -142,9 +142,7 @@ def drawn_offset(robot: RobotParameters, world: int) -> vec12:
 def drawn_push(robot: RobotParameters, world: int) -> vec6:
     """Push on the base, world axes: force in units of 5 N, torque in units of 3 N m."""
     wrench = robot.push[world]
-    return vec6(
-        wrench[0] / 5.0, wrench[1] / 5.0, wrench[2] / 5.0, wrench[3] / 3.0, wrench[4] / 3.0, wrench[5] / 3.0
-    )  # fmt: skip
+    return vec6(wrench[0] / 5.0, wrench[1] / 5.0, wrench[2] / 5.0, wrench[3] / 3.0, wrench[4] / 3.0, wrench[5] / 3.0)
 
 
 set_mirror((1,), height, drawn_latency)

@@ -175,9 +175,7 @@ def motors_kernel(
 
 
 @wp.func
-def gains(
-    robot: RobotParameters, rng: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
-):  # fmt: skip
+def gains(robot: RobotParameters, rng: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float):
     """Scale kp and kd of each motor by random factors [1] from the two ranges."""
     for m in range(rng.lane, 12, rng.lanes):
         ratio = wp.vec2(uniform(rng, m, kp_lower, kp_upper), uniform(rng, 12 + m, kd_lower, kd_upper))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.bench.bus_sim import BusFaults
-from jumper_warp.bench.logs import motions_of_log
+from jumper_warp.bench.logs import LogCfg, motions_of_log, play_log, simulated_again
 from jumper_warp.deploy.estimator import Estimator
 from jumper_warp.deploy.log import Log, read_log, replay
 from jumper_warp.deploy.motions import joint_test
@@ -128,6 +128,21 @@ def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_
     sent = np.array([bundle.joints.codec.decode_command(frames)[2] for frames in ticks["sent"][1:]])
     entered = (ticks["sent"][1:, :, :7] == 0xFF).all(axis=(1, 2))  # frames that switch motors
     assert sent[~entered] == pytest.approx(ticks["kp"][:-1][~entered], abs=0.1)
+
+
+def test_log_is_shown_with_its_simulation_from_the_first_estimate_on(make_robot, bundle, tmp_path, capsys):
+    robot = make_robot()
+    log = Log(tmp_path / "log", bundle, 480, capture=True)
+    robot.runtime.listener = log.tick
+    robot.enable(200)
+    robot.run(360, Request.CONFIRM)
+    log.close()
+    ticks = read_log(tmp_path / "log")[0].copy()
+    ticks[:240]["position"] = 0.0
+    assert simulated_again(ticks[:2], 480)[0, 2] > 0.3  # [m] at the default height
+    (tmp_path / "log" / "ticks.bin").write_bytes(ticks.tobytes())
+    play_log(LogCfg(tmp_path / "log", tmp_path / "shown"))
+    assert capsys.readouterr().out.startswith(f"{(len(ticks) - 240) / 480:.1f} s")
 
 
 def test_zeroing_makes_the_angle_of_one_joint_its_offset(make_robot):

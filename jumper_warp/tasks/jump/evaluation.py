@@ -50,9 +50,7 @@ class HeightEvaluation(JumpEvaluation):
     """[s] Length of the recording of `jumper play`."""
 
     flags: ClassVar = "jumper_warp.evaluation.jump_metrics:Height"
-    published: ClassVar = {
-        "apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0,
-    }  # fmt: skip
+    published: ClassVar = {"apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0}
     """Metrics of the paper's simulation; it evaluates the apex only."""
 
 

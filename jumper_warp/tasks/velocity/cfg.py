@@ -38,9 +38,7 @@ class VelocityEvaluation(Evaluation):
     """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z, in both directions."""
 
     flags: ClassVar = "jumper_warp.evaluation.velocities:Velocity"
-    published: ClassVar = {
-        "slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12
-    }  # fmt: skip
+    published: ClassVar = {"slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12}
     """Tracking errors of the paper: one test on the robot, with commands up to 0.8 m/s or rad/s given by a person."""
 
     def prepare_task(self, task: TaskCfg) -> TaskCfg:

@@ -61,9 +61,7 @@ def sample_action(
 
 
 @triton.jit
-def record_step(
-    reward, done, timeout, rewards, dones, timeouts, episode, finished, rows, scale, B: tl.constexpr
-):  # fmt: skip
+def record_step(reward, done, timeout, rewards, dones, timeouts, episode, finished, rows, scale, B: tl.constexpr):
     """Write a step's reward, done and timeout, (rows,) each, to the rollout; update the episodes' returns and lengths.
 
     episode: (2, rows) and finished: (3, rows), float64, as in `Collector`.
