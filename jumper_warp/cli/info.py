@@ -112,8 +112,9 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in shown:
         cells = (_cell(key, row["metrics"].get(key)) for key in columns.values())
         table.add_row(row["condition"].replace("_", " "), *cells)
-    trials = max(metric["trials"] or 0 for metric in shown[0]["metrics"].values())
-    notes = [f"{trials:,} trials a line" + (f"; commands: {commands}" if commands else "")]
+    trials = {max(metric["trials"] or 0 for metric in row["metrics"].values()) for row in shown}
+    counts = " or ".join(f"{count:,}" for count in sorted(trials))
+    notes = [f"{counts} trials a line" + (f"; commands: {commands}" if commands else "")]
     if any("mujoco" in row["condition"] for row in shown):
         notes.append("mujoco: on Newton's SolverMuJoCo; all others on SolverJumper")
     return [*table_lines(table), *notes]

@@ -60,7 +60,7 @@ class TrainArgs:
     """Robot: its folder or name, or an overlay. Robots are sampled around its values. Its randomisation ranges override
     the task's; flags override both."""
     preset: str | None = None
-    """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 20
+    """Named group of settings, which other flags override: `laptop` trains a nominal robot on two CPU cores, in 5 to 30
     minutes."""
     watch: bool = False
     """Show the training while it runs: robots, reward terms and learning curves. `jumper watch RUN` joins later."""
