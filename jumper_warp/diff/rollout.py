@@ -274,7 +274,9 @@ class Rollout(Uncopied):
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
         initial: Any = q[7:] if initial_target is None else initial_target
         shape = (len(initial), 12) if np.ndim(initial) == 3 else (12,)
-        commands.initial_target = self._input("initial_target", initial, shape).reshape((-1, 12, self.num_worlds))
+        commands.initial_target = (
+            self._input("initial_target", initial, shape).contiguous().reshape((-1, 12, self.num_worlds))
+        )
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
