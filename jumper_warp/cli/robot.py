@@ -95,6 +95,7 @@ def new(cfg: NewCfg) -> None:
         types = [motor.type for motor in robot.description.motors]
         kinds = {name: len({*zip(types, row, strict=False)}) for name, row in robot.values.items() if len(row) == 12}
         lost = [name for name in robot.values if name in LOST[FILE] or kinds.get(name, 0) > len({*types})]
+        lost += ["randomization"] if robot.randomization else []
         if lost:
             print(f"{FILE} has no place for these values of {cfg.like}, or one a type of motor: {', '.join(lost)}")
     print(write_robot(cfg.out, {**table, "name": cfg.out.name}))

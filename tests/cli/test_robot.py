@@ -63,9 +63,9 @@ def test_training_uses_and_saves_the_overlay(overlay):
 
 def test_new_folder_of_an_overlay_names_the_values_that_it_loses(tmp_path, capsys):
     values = {"latency": (0.004,), "base_mass": (9.0,), "kp": (0.9,) * 12, "armature": (*[0.02] * 11, 0.03)}
-    RobotOverlay(values).save(tmp_path / "overlay.json")
+    RobotOverlay(values, {"gains": (0.9, 1.1)}).save(tmp_path / "overlay.json")
     robot(["new", str(tmp_path / "mine"), "--from", str(tmp_path / "overlay.json")])
-    assert capsys.readouterr().out.splitlines()[0].endswith("of motor: latency, armature")
+    assert capsys.readouterr().out.splitlines()[0].endswith("of motor: latency, armature, randomization")
 
 
 def test_new_folder_of_a_robot_is_checked_and_drawn(tmp_path, capsys):
