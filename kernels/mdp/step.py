@@ -131,7 +131,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     success = wp.static(bool(endings[i].success))
 
         begun = episode.history_reset[world] == BEGUN
-        counted = begun or episode.done[world] == 0.0  # an ended episode that goes on counts once
+        counted = begun or episode.done[world] == 0.0  # an ended episode that continues counts once
         ended = termination != NOT_TERMINATED
         total = float(0.0)
         finite = bool(True)
