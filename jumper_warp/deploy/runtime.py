@@ -154,10 +154,13 @@ class Runtime:
             self._rest += (np.concatenate([self.gyro, self.accel, self.q]) - self._rest) / max(1, self._rest_ticks)
             if self._rest_ticks == 1 or (record["request"] == Request.STAND and not moves):
                 self.source.reset(self._rest[:3], self._rest[3:6], self._rest[6:])
+        dropped = round(float(record["late"]) / self.dt)  # ticks before this one, see `run_loop`
+        self._time += dropped * self._step
         if self.ready:
             if received["sensor_fresh"][2:].all():
                 self.source.receive(received["sensor"][2:])
-            self.estimate = self.source.update(self.gyro, self.accel, self.q, self.qd, self.torque, self.dt)
+            passed = (1 + dropped) * self.dt
+            self.estimate = self.source.update(self.gyro, self.accel, self.q, self.qd, self.torque, passed)
         if not self.estimate.diverged:
             self._contact = self.estimate.contact
         record["angle"], record["rate"], record["torque"] = self.q, self.qd, self.torque

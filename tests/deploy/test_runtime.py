@@ -12,6 +12,7 @@ from jumper_warp.deploy.log import Log, read_log, replay
 from jumper_warp.deploy.motions import joint_test
 from jumper_warp.deploy.runtime import Request, State
 from jumper_warp.deploy.safety import Fault
+from jumper_warp.deploy.sensors import MotionCapture
 from jumper_warp.utils.errors import InputError
 
 
@@ -187,6 +188,27 @@ def test_policy_acts_every_eighth_or_ninth_tick_at_500_hz(make_robot):
     for tick in range(100):  # noqa: B007
         robot.run(1)
     assert set(np.diff(acted)) == {8, 9} and len(acted) == 12
+
+
+def test_ticks_that_a_late_one_drops_count_for_policy_and_estimator(make_robot):
+    """One tick is late by two: the policy acts in the eighth tick of time, which is the sixth that ran."""
+    spans, acted = [], []
+
+    class Source(MotionCapture):
+        def update(self, *readings):
+            spans.append(readings[-1])
+            return super().update(*readings)
+
+    robot = make_robot(source=Source())
+    robot.stand()
+    robot.run(1, Request.WALK)
+    targets = robot.runtime.skill.targets
+    robot.runtime.skill.targets = lambda motion: acted.append(tick) or targets(motion)
+    del spans[:]
+    for tick, late in enumerate([0.1, 0.2, 2.3, 0.4, -0.2, 0.0, 0.0], 1):  # noqa: B007
+        robot.run(1, late=late / 480.0)
+    assert np.multiply(spans, 480.0) == pytest.approx([1, 1, 3, 1, 1, 1, 1])
+    assert acted == [6]
 
 
 def test_skill_begins_at_rest_for_0_3_s_with_the_action_of_the_present_targets(make_robot, bundle):
