@@ -23,7 +23,7 @@ from jumper_warp.bench.faults import BusFaults
 from jumper_warp.deploy.bundle import Bundle
 from jumper_warp.deploy.bus import Link, open_buses
 from jumper_warp.deploy.estimator import Estimator
-from jumper_warp.deploy.runtime import ENTER_TICKS, REST_TICKS, Request, Runtime, State
+from jumper_warp.deploy.runtime import ENTER_TICKS, Request, Runtime, State
 from jumper_warp.deploy.sensors import Estimate, MotionCapture
 from jumper_warp.deploy.skills import Motion, Walk, rotate
 from jumper_warp.policies.policy import load_policy
@@ -82,9 +82,9 @@ class Bench:
             self.far.bias[0] = self.rng.normal(0.0, JOINT_OFFSET, 12)
         source = Estimator() if self.args.estimator else MotionCapture()
         runtime = Runtime(self.bundle, self.link, source, rate=self.args.rate)
-        for request in [Request.NONE] * REST_TICKS + [Request.STAND]:
+        while runtime.state == State.PASSIVE:  # until it has been at rest for long enough
             self.far.restart()  # stand at rest while the motors are off
-            runtime.tick(request)
+            runtime.tick(Request.STAND)
         for _ in range(ENTER_TICKS):
             runtime.tick()
         return runtime
