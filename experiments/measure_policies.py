@@ -57,9 +57,9 @@ def with_trials(flags: Any, trials: int) -> Any:
     if isinstance(flags, JumpFlags):
         return replace(flags, num_jumps=trials)
     if isinstance(flags, AttitudeFlags):
-        return replace(flags, num_turns=trials)
+        return replace(flags, num_turns=max(trials, 6))
     assert isinstance(flags, VelocityFlags)
-    per_axis = next(n for n in range(2, trials) if 2 * n**3 + STANDING >= trials)
+    per_axis = next(n for n in range(2, trials + 2) if 2 * n**3 + STANDING >= trials)
     return replace(flags, commands_per_axis=per_axis)
 
 

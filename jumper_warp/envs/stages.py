@@ -298,10 +298,10 @@ class Stages(Uncopied):
     def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
         """Set tasks' commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad].
 
-        A gait frequency of 0, the fourth value, becomes the task's.
+        In a new episode, a gait frequency of 0, the fourth value, becomes the task's.
         """
         for skill in self.skills:
-            gait = (0.0, 0.0, 0.0, getattr(skill.task.reset.settings, "gait", 0.0))
+            gait = (0.0, 0.0, 0.0, begins * getattr(skill.task.reset.settings, "gait", 0.0))
             commands = wp.array(np.where(values == 0.0, gait, values), dtype=wp.vec4, device=self.wp_device)
             self._launch(
                 skill.kernels["set_command"], self.num_envs,

@@ -80,7 +80,9 @@ class CourseLog(EvaluationLog):
         self.switch_step = np.full(shape, -1)  # (robots, commands) policy step in which the jump skill took over
         self.takeoff_step = np.full(shape, -1)  # (robots, commands) policy step of the takeoff
         self.finish_step = np.full(shape, -1)  # (robots, commands) policy step in which the command finished
-        self.apex = np.full(shape, np.nan)  # [m] (robots, commands) apex of the jump so far, see `updated_apex`
+        self.apex = np.full(
+            shape, np.nan
+        )  # [m] (robots, commands) apex above the goal's ground so far, see `updated_apex`
         self.offset = np.full((n, k, 2), np.nan)  # [m] from the goal to the base as walking takes over, world axes
         self.goal_world = np.full((n, k, 2), np.nan)  # [m] of jumps to a place whose skill took over, world axes
         # one array per policy step
@@ -139,7 +141,7 @@ class CourseLog(EvaluationLog):
         }  # fmt: skip
         rows = np.arange(len(q))
         kind = self.target_skill[rows, self._at]
-        for name in ("goal", "phase", "took_off", "touched_down"):
+        for name in ("goal", "goal_ground", "phase", "took_off", "touched_down"):
             by_skill = [records(env.skills[skill].states)[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays
@@ -217,8 +219,9 @@ class CourseLog(EvaluationLog):
         self.takeoff_step[row[took_off], self.current[row[took_off]]] = step
         jumping = row[jumps & (previous[row] == kind)]
         jump = {name: arrays[f"jump_{name}"][jumping] for name in ("phase", "took_off", "touched_down")}
+        jump["base_pos"] = arrays["base_pos"][jumping] - arrays["jump_goal_ground"][jumping, None]
         now = (jumping, self.current[jumping])
-        self.apex[now] = updated_apex(self.apex[now], jump | {"base_pos": arrays["base_pos"][jumping]})
+        self.apex[now] = updated_apex(self.apex[now], jump)
         offset = (arrays["base_pos"] - arrays["jump_goal"])[row[left], :2]
         self.offset[row[left], self.current[row[left]]] = offset
         walked = ~jumps & (since >= np.round(self.durations[at] / step_dt))

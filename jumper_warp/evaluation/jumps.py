@@ -280,6 +280,7 @@ class JumpLog(EvaluationLog):
         if due.any():
             goals = np.zeros((env.num_envs, 3), dtype=np.float32)
             goals[due] = self.goals[due, self.current[due]]
+            self.stance[due, self.current[due]] = self.arrays["base_pos"][due, 2]
             env.command(goals, due)
         return ended
 

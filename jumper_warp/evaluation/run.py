@@ -166,7 +166,8 @@ class Run(ABC):
         return values
 
     def note_robot(self, env: Env) -> None:
-        """Store, for the report, an environment's robot overlay (values of one robot) and randomisation ranges."""
+        """Store gravity, robot overlay (values of one robot) and randomisation ranges of an environment."""
+        self.settings["gravity_m_s2"] = env.task.gravity
         trained, robot = (self.trained_robot or RobotOverlay({})).description, env.sim.descriptions[0]
         if robot.name not in (trained.name, self._announced):
             self._announced = robot.name
@@ -300,7 +301,6 @@ class EvaluationRun(Run):
         conditions = conditions or self.conditions
         env = env_of_recipe(self.recipe, count, conditions, change=change, **scene)
         self.policy.to(env.device)
-        self.settings["gravity_m_s2"] = env.task.gravity
         self.settings["torque_limit_nm"] = torque_limit(env)
         self.note_robot(env)
         return env

@@ -329,7 +329,7 @@ class Session:
         }
         velocity = body_velocity(base)[0]
         walks = self.tasks[self.skill].state is VelocityState
-        series = {"height/base [m]": self.position[2]}
+        series = {"height/base [m]": self.position[2] - self.surface(*self.position[:2, None])[0]}
         series["height/commanded [m]"] = self.jump.height if self.jump and self.jump.height else np.nan
         for name, unit, actual, commanded in zip(
             ("ahead", "to the left", "yaw rate"), ("m/s", "m/s", "rad/s"), velocity, self.command, strict=True

@@ -62,7 +62,7 @@ class PpoCfg:
     """Target KL divergence per update [nat]. Above twice this value the learning rate falls, below half of it the
     learning rate rises. 0: fixed learning rate."""
     final_desired_kl: float = 0.002
-    """Target KL divergence at the end [nat], approached linearly in the second half of a training."""
+    """Target KL divergence at the end [nat], at most `desired_kl`, approached linearly in the second half."""
     max_grad_norm: float = 1.0
     """Norm to which the gradients of actor and critic are each clipped."""
     init_std: float = 1.0

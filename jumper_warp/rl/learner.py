@@ -15,6 +15,7 @@ import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.distributed import all_reduce_mean
 from jumper_warp.rl.flat import FlatAdam, FlatParameters
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import symmetry_of
@@ -146,6 +147,7 @@ class Learner(ABC):
         """
         cfg, decay = self.cfg, min(max(2.0 * progress - 1.0, 0.0), 1.0)
         self._desired_kl.fill_((1.0 - decay) * cfg.desired_kl + decay * min(cfg.final_desired_kl, cfg.desired_kl))
+        all_reduce_mean(self._desired_kl)  # all processes adapt the learning rate alike, although their clocks differ
         final = cfg.entropy_coef if cfg.final_entropy_coef is None else cfg.final_entropy_coef
         self._entropy_coef.fill_((1.0 - decay) * cfg.entropy_coef + decay * final)
 

@@ -43,7 +43,7 @@ class RandomizationCfg:
     com_shift: Range = (-0.03, 0.03)
     """[m] Shift of the base's centre of mass along each body axis."""
     gains: Range = (0.6, 1.4)
-    """[1] Factor on kp of each motor, and on kd unless `damping_gains` is set."""
+    """[1] Factor on kp of each motor; kd has another sample of this range, unless `damping_gains` is set."""
     no_load_speed: Range = (0.8, 1.2)
     """[1] Factor on the no-load speed of each motor."""
     cutoff_speed: Range = (0.8, 1.4)
@@ -72,7 +72,7 @@ class RandomizationCfg:
     push_in_flight: bool = False
     """Whether pushes also act while no paw is on the ground."""
     damping_gains: Range = None
-    """[1] Factor on kd of each motor; None: the same factor as on kp."""
+    """[1] Factor on kd of each motor; None: a sample of `gains`, independent of kp."""
     resample_at: Literal["startup", "reset"] = "reset"
     """When parameters other than pushes are sampled: once at startup, or at every reset of a world."""
 

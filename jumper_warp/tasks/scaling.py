@@ -31,7 +31,9 @@ OF_TERM = {
     "lin_vel_xy_l1": {"weight": "1/speed"},
     "lin_vel_z_l2": {"weight": "1/speed^2"}, "slip": {"weight": "1/speed^2"}, "touchdown": {"weight": "1/speed^2"},
     "foot_clearance": {"weight": "1/(leg^2 speed)"}, "touchdown_tracking": {"std": "gain"},
-    "squat": {"std": "height"}, "shallow_squat": {"tolerance": "height"},
+    "squat": {"std": "height"}, "shallow_squat": {"tolerance": "height"}, "settled": {"std": "speed"},
+    "tracking": {"std": "gain"}, "estimated_tracking": {"std": "gain"},
+    "jump_height": {"std": "gain", "scale": "gain"}, "estimated_jump_height": {"std": "gain", "scale": "gain"},
 }  # fmt: skip
 """Measures of numbers of a term by the term's name, which take precedence over BY_NAME."""
 OF_FIELD = {
@@ -85,6 +87,11 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
         names = {spec.name for spec in fields(cfg)}
         return replace(cfg, **{name: times(getattr(cfg, name), kind) for name, kind in kinds.items() if name in names})
 
+    def of_velocity(velocity: Any) -> Any:
+        *ahead, aside, turning = velocity
+        slow = (1.0e-3, 1.0e-3) if ours.locked else (aside * speed, turning)
+        return (*times(tuple(ahead), "speed"), *slow)
+
     def of_level(level: Any) -> Any:
         level = of_fields(level)
         if hasattr(level, "goal_lower"):
@@ -94,12 +101,8 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
                 ends[name] = (*times((x, 0.0 if ours.locked else y), "gain"), times(z, "apex") if z else z)
             return replace(level, **ends)
         if hasattr(level, "first_range"):
-            ranges = {}
-            for name in ("first_range", "last_range"):
-                ahead, back, aside, turning = getattr(level, name)
-                slow = (1.0e-3, 1.0e-3) if ours.locked else (aside * speed, turning)
-                ranges[name] = (ahead * speed, back * speed, *slow)
-            smallest = 0.0 if ours.locked else level.smallest
+            ranges = {name: of_velocity(getattr(level, name)) for name in ("first_range", "last_range")}
+            smallest = 0.0 if ours.locked else level.smallest * speed
             turns = 0.0 if ours.locked else level.turn_in_place_probability
             return replace(level, **ranges, smallest=smallest, turn_in_place_probability=turns)
         return level
@@ -116,6 +119,9 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
             settings = on_fixed_paws(settings, ours)
     places = {} if not hasattr(task.evaluation, "goal_x") else {"success_range": "gain"}
     heights = {} if not hasattr(task.evaluation, "height_range") else {"height": "apex"}
+    evaluation: Any = of_fields(task.evaluation, OF_FIELD | places | heights)
+    if hasattr(evaluation, "max_velocity"):
+        evaluation = replace(evaluation, max_velocity=of_velocity(evaluation.max_velocity))
     return replace(
         of_fields(task),
         advance=of_term(task.advance),
@@ -127,7 +133,7 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
         randomization=of_fields(task.randomization),
         motors=motors_for(task.motors, robot),
         command_filter=command_filter,
-        evaluation=of_fields(task.evaluation, OF_FIELD | places | heights),
+        evaluation=evaluation,
     )
 
 

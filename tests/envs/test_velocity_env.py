@@ -109,11 +109,13 @@ def test_leaving_the_map_ends_the_episode_as_a_time_out(rough):
     assert states_of(rough)["falls"][5] == 0.0
 
 
-def test_commands_without_a_gait_frequency_have_that_of_the_task():
+def test_commands_without_a_gait_frequency_keep_it_and_episodes_begin_with_that_of_the_task():
     env = walking_env(2, "velocity-trot")
     env.evaluation_reset(np.zeros(3))
     assert env.skills[0].states.numpy()["pace"] == pytest.approx(2.0 / 60.0)
     env.command([[0.3, 0.0, 0.0, 1.5], [0.3, 0.0, 0.0, 0.0]])
+    assert env.skills[0].states.numpy()["pace"] == pytest.approx([1.5 / 60.0, 2.0 / 60.0])
+    env.command([0.3, 0.0, 0.0])
     assert env.skills[0].states.numpy()["pace"] == pytest.approx([1.5 / 60.0, 2.0 / 60.0])
 
 

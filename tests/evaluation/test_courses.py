@@ -23,8 +23,12 @@ SCRIPT = (  # 120 policy steps of walking, a jump, 90 of walking
 class ScriptedEnv:
     """Robots that stop 50 steps after a jump is requested, take off 25 steps later and finish 40 steps after that."""
 
-    def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
-        """Create n standing robots; error: velocity error; falls_at: (n,) policy step of each fall, -1: none."""
+    def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False, ground=0.0):
+        """Create n standing robots.
+
+        error: of the velocity; falls_at: (n,) policy step of each fall, -1: none; ground: height [m].
+        """
+        self.ground = ground
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
         self.skill, self.commands, self.age, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
         self.step_dt, self.steps, self.velocity, self.requests = DT, 0, np.zeros((n, 3)), []
@@ -59,6 +63,7 @@ class ScriptedEnv:
         heights = 0.78 - 0.002 * (self.age - 35) ** 2  # [m] apex 35 steps after the handover, back at 0.58 m
         base_pos = np.stack([np.full(self.n, 0.05), np.zeros(self.n), np.where(jumping, heights, 0.4)], axis=1)
         base_pos[jumping & (self.age > 50), 2] = 0.9  # [m] higher after touchdown, which is no apex
+        base_pos[:, 2] += self.ground
         for w in range(self.n):
             if self.skill[w] == WALK and self.commands[w] >= 0 and self.age[w] >= 50 and not self.never_stops:
                 self.skill[w], self.commands[w], self.age[w] = self.commands[w], -1, 0
@@ -71,6 +76,7 @@ class ScriptedEnv:
             "base_ang_vel": (self.velocity + self.error)[:, 2:] * [0.0, 0.0, 1.0],
             "skill": self.skill.copy(), "termination": termination,
             "force": np.tile([30.0, 31.0, 32.0, 33.0], (self.n, 1)) + (self.steps % 2),
+            "jump_goal_ground": np.full(self.n, self.ground),
             "jump_goal": np.zeros((self.n, 3)), "jump_took_off": took_off.astype(int),
             "jump_touched_down": touched_down.astype(int), "jump_phase": phase,
         }  # fmt: skip
@@ -116,6 +122,10 @@ def test_course_metrics_match_hand_computed_values():
     assert metrics["command_to_jump_skill_mean_s"] == pytest.approx(50 * DT)
     assert (metrics["finished_rate"], metrics["finished_on_goal_rate"], metrics["jump_made_rate"]) == (1, 1, 1)
     assert metrics["handover_force_ripple_mean_n"] == pytest.approx(1.0) == metrics["handover_force_step_mean_n"]
+
+
+def test_apex_on_a_block_is_above_the_block():
+    assert run_course(ground=0.05)[0].apex_error[0, 1] == pytest.approx(0.03)
 
 
 def test_landing_error_is_distance_from_goal_and_beyond_tolerance_off_goal():

@@ -306,10 +306,13 @@ def two_in_a_row():
 
 
 def test_next_jump_is_commanded_only_after_rest_of_landed_jump():
-    _, env = two_in_a_row()
+    landings, env = two_in_a_row()
     ((goals, worlds),) = env.commanded
     assert worlds.tolist() == [True, False]
     assert goals[0] == pytest.approx([0.7, 0.0, 0.0])
+    env.set(base_pos=[0.8, 0.15, 0.28])  # it squats
+    landings.record_step(env)
+    assert landings.outcome.stance_m[0, 1] == pytest.approx(0.3)
 
 
 def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():

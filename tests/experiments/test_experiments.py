@@ -235,6 +235,7 @@ def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
     metrics = read_values(tmp_path)
     assert metrics == values
     assert metrics["finished_rate"] == metrics["jump_made_rate"] == 1.0
+    assert json.loads((tmp_path / "metrics.json").read_text())["conditions"]["gravity_m_s2"] == 9.81
     assert metrics["apex_error_abs_mean_m"] < 0.05 and metrics["goal_distance_at_handover_mean_m"] < 0.05
     assert 0.0 < metrics["settled_slewed_rmse_vx_m_s"] < 0.2 and 0.2 < metrics["command_to_takeoff_mean_s"] < 2.5
     assert (tmp_path / "timeline.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000

@@ -10,9 +10,12 @@ import pytest
 
 from docs.policy_tables import MEASURED, filled, pages
 from experiments import measure_policies
-from experiments.measure_policies import payload_overlay
+from experiments.measure_policies import payload_overlay, with_trials
 from jumper_warp.cli.main import main as jumper
+from jumper_warp.evaluation.attitude import AttitudeFlags
+from jumper_warp.evaluation.jump_metrics import HeightFlags
 from jumper_warp.evaluation.run import EvaluationRun
+from jumper_warp.evaluation.velocities import VelocityFlags
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.assets import POLICIES, policy_tasks
@@ -34,6 +37,13 @@ def test_payload_keeps_springs_and_moves_the_mass_towards_the_centre_of_the_base
     np.testing.assert_allclose(robot.base_com, [[-0.0094 * share, 0.0, 0.0111 * share]])  # [m]
     np.testing.assert_allclose(robot.base_mass / base * robot.base_inertia, 1.0)  # what the model scales inertia by
     assert robot.spring_stiffness[0, 0] == 600.0
+
+
+@pytest.mark.parametrize("trials", [1, 5, 300])
+def test_every_kind_of_test_has_at_least_the_wanted_number_of_trials(trials):
+    jumps, turns, walks = (with_trials(flags(), trials) for flags in (HeightFlags, AttitudeFlags, VelocityFlags))
+    assert jumps.num_jumps == trials and turns.num_turns == max(trials, 6)
+    assert walks.commands_per_axis == {1: 2, 5: 2, 300: 5}[trials]  # 2 n^3 walks, and 64 that stand
 
 
 def test_condition_is_undefined_only_where_its_change_does_nothing():

@@ -136,15 +136,16 @@ def join(rank: int, port: int) -> None:
 
 
 def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
-    """Update from half of the worlds in one of two processes, and save the state to path + rank."""
+    """Update from half of the worlds in one of two processes, whose clocks differ; save the state to path + rank."""
     join(rank, port)
     init_distributed("cpu")
     torch.manual_seed(0)
     ppo = Ppo(PushTask(4), cfg)
     fill(ppo, slice(4 * rank, 4 * rank + 4), 8)
     ppo.order = lambda: local_order(rank, ppo.batch_size)
+    ppo.set_progress(0.6 + 0.2 * rank)
     ppo.update()
-    torch.save(ppo.state_dict(), path + str(rank))
+    torch.save({"desired_kl": ppo._desired_kl, **ppo.state_dict()}, path + str(rank))
     torch.distributed.destroy_process_group()
 
 

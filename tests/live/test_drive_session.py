@@ -144,6 +144,8 @@ def test_robot_begins_anew_on_another_ground(walker):
         assert point[2] == pytest.approx(walker.surface(point[:1], point[1:2])[0], abs=0.02)
         assert abs(point[2]) > 0.02  # beyond the level middle
         assert not walker.fallen
+        walker.position = np.array([*point[:2], point[2] + 0.3])
+        assert walker.series()["height/base [m]"] == pytest.approx(0.3, abs=0.02)
     finally:
         walker.build("flat")
 

@@ -71,3 +71,24 @@ def test_landings_are_those_of_solver_mujoco(site):
     jumps = node("jumps", site, "horizontal_jump", json.dumps([{"goal": place} for place in PLACES]))
     _, places = reference("horizontal_jump", np.array(PLACES)[:, None])
     assert np.linalg.norm([jump["place"] for jump in jumps] - places, axis=1).max() < 0.004
+
+
+def test_push_acts_for_its_time():
+    """A push of 70 N for 0.2 s on a robot that stands: 14 N s."""
+    code = f"""
+        import {{ Session, DT }} from {json.dumps((PAGE / "session.js").as_uri())};
+        const policy = {{ range: {{ a: [-1, 1], b: [-1, 1], c: [-1, 1] }}, reset() {{}}, targets: () => [] }};
+        let impulse = 0;
+        const robot = {{
+            push: [0, 0, 0, 0, 0, 0], velocity: [0, 0, 0], position: [0, 0, 0.3], contactTime: [1, 1, 1, 1], tilt: 0,
+            height: 0.3, reset() {{ this.push.fill(0); }}, readings: () => ({{ lin_vel: [0, 0, 0] }}),
+            offset: () => [0, 0], step() {{ impulse += this.push[0] * DT; }},
+        }};
+        const session = new Session(robot, {{ walk: policy }});
+        session.push([70, 0, 0], 0.2);
+        for (let i = 0; i < 60; i++) session.step();
+        console.log(impulse);
+    """
+    program = Path(nodejs.__path__[0], "bin", "node")
+    done = subprocess.run([program, "--input-type=module", "-e", code], capture_output=True, text=True)
+    assert float(done.stdout) == pytest.approx(14.0), done.stderr

@@ -186,6 +186,7 @@ def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
         for pair in zip(*orders, strict=True) for rank, order in enumerate(pair)
     ]  # fmt: skip
     whole.order = lambda: torch.cat(parts)
+    whole.set_progress(0.7)
     start = {name: value.clone() for name, value in whole.model.state_dict().items()}
     whole.update()
     while not processes.join():
@@ -197,6 +198,7 @@ def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
             torch.testing.assert_close(result["model"][name], value, atol=1e-5, rtol=1e-5, msg=name)
             assert not torch.equal(value, start[name]), name
         torch.testing.assert_close(result["lr"], expected["lr"])
+        torch.testing.assert_close(result["desired_kl"], whole._desired_kl)
 
 
 FLOAT32_COUNT_LIMIT = 2.0**24

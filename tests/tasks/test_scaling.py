@@ -58,10 +58,27 @@ def test_squat_of_a_heavy_robot_is_in_its_measures():
     assert (squat.numbers["std"], end.numbers["tolerance"]) == pytest.approx((0.03 * low, 0.04 * low))
 
 
+def test_lengths_and_speeds_of_a_small_robots_rewards_are_below_the_jumpers():
+    names = {
+        "horizontal-jump-paper": {"tracking": ["std"], "estimated_tracking": ["std", "std_wide"]},
+        "vertical-jump-paper": {"jump_height": ["std", "scale"], "estimated_jump_height": ["std", "scale"]},
+        "horizontal-jump-standing": {"settled": ["std"], "base_at_rest": ["std_lin_vel"]},
+    }
+    for task, terms in names.items():
+        small, usual = (make_task(task, robot).rewards for robot in (load_overlay("small_direct_drive"), None))
+        for ours, theirs in zip(small, usual, strict=True):
+            for name in terms.get(ours.name, []):
+                ratio = ours.numbers[name] / theirs.numbers[name]
+                assert ratio == pytest.approx(0.726 if task.endswith("standing") else 0.698, abs=0.001), ours.name
+    smallest = [make_task("velocity-paper", robot).levels[0].smallest for robot in (load_overlay("heavy"), None)]
+    assert smallest[0] / smallest[1] == pytest.approx(1.21, abs=0.01)
+
+
 def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only():
     task = make_task("velocity-flat", load_overlay("small_direct_drive"))
     settings = task.reset.settings
     assert settings.tilt == 0.0 and settings.front_y[0] == settings.front_y[1] == pytest.approx(0.11)
+    assert 0.5 < task.evaluation.max_velocity[0] < 0.65 and max(task.evaluation.max_velocity[1:]) < 0.01
     ahead, back, aside, turning = task.levels[0].last_range
     assert min(ahead, back) > 1.0 and max(aside, turning) < 0.01
     assert task.command_filter.lateral.upper == 0.01

@@ -70,7 +70,7 @@ function step() {
     const { position, velocity } = robot;
     const force = session.drag.map((target, i) => PULL[0] * (target - position[i]) - PULL[1] * velocity[i]);
     const size = Math.hypot(...force);
-    session.push(force.map((x) => x * Math.min(1, PULL[2] / size)), 2 * DT);
+    session.push(force.map((x) => x * Math.min(1, PULL[2] / size)), DT);
   }
   session.step();
   const poses = robot.poses(new Float32Array(7 * robot.model.nbody));

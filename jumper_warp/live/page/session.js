@@ -54,7 +54,7 @@ export class Session {
 
   step() {
     const { robot } = this;
-    if (this.pushSteps > 0 && --this.pushSteps === 0) robot.push.fill(0);
+    if (this.pushSteps-- <= 0) robot.push.fill(0);
     if (this.fallen) { // the pose stays: links do not touch the ground, and the robot would sink into it
       this.fallenTime += DT;
       if (this.fallenTime > FALL_TIME) this.reset();

@@ -83,7 +83,10 @@ class Level:
     base_height: Pair  # [m] Height of the base in standing starts; low ones are deep squats
     next_jump_probability: float = 0.0  # [1] Probability of another goal after a landing
     elliptical: bool = False
-    """Whether goals lie in the ellipse within the box, with half axes up to its edges, instead of in the box."""
+    """Whether goals lie in the ellipse within the box, with half axes up to its edges, instead of in the box.
+
+    The box must contain the start.
+    """
 
     struct = JumpLevel  # Kernels' struct that `values` returns
 
