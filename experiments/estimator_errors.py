@@ -167,8 +167,7 @@ def main(args: Args) -> dict:
     """Record motions, estimate, plot the errors and return the metrics."""
     run = EvaluationRun.from_args("estimator_errors", args, Evaluation)
     true = record(run, args)
-    data = readings(true, args)
-    found = errors(true, data, args)
+    found = errors(true, readings(true, args), args)
     jumps = isinstance(run.evaluation, (HeightEvaluation, PlaceEvaluation))
     count = found["tilt"].shape[1]
     last, ticks = landing(true["contact"][REST + 1 :])

@@ -116,8 +116,7 @@ class GradientRun:
         )
         self._q, self._qd = (self.rollout.array(np.repeat(row, worlds, axis=1)) for row in compact(*start()))
         self._targets = self.rollout.array(np.repeat(schedule()[:, :, None], worlds, axis=2))
-        trajectory = self.forward()
-        cotangent = np.zeros(trajectory.q.shape)
+        cotangent = np.zeros(self.forward().q.shape)
         cotangent[-1, 2] = 1.0
         self._cotangent = self.rollout.array(cotangent)
 

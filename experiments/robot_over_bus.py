@@ -178,8 +178,7 @@ def read_state(sim: Simulation, motion: Motion) -> None:
     q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
     contact = np.linalg.norm(sim.paw_force.numpy()[:, 0], axis=-1) > CONTACT_FORCE
     estimate = Estimate(q[:3], sim.base_velocity()[0], q[3:7], contact, False)
-    gyro = rotate(q[3:7], qd[3:6], inverse=True)
-    motion.update(estimate, gyro, motor_values(q[7:]), motor_values(qd[6:]))
+    motion.update(estimate, rotate(q[3:7], qd[3:6], inverse=True), motor_values(q[7:]), motor_values(qd[6:]))
 
 
 def trajectory(rows: list) -> dict[str, np.ndarray]:
@@ -242,8 +241,7 @@ def main(args: Args) -> dict:
         courses = [bench.course(rng.uniform(low, high)) for _ in range(args.courses)]
         metrics |= {"courses": len(courses), "courses_done": int(np.sum(courses))}
         metrics["largest_torque_over_limit_Nm"] = bench.far.largest_torque.tolist()
-    folder = output_dir("robot_over_bus", args.out)
-    write_atomically(folder / "metrics.json", json_bytes(metrics))
+    write_atomically(output_dir("robot_over_bus", args.out) / "metrics.json", json_bytes(metrics))
     print(json_bytes(metrics).decode())
     return metrics
 

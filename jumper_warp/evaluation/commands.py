@@ -305,8 +305,7 @@ def play_dump(cfg: DumpCfg) -> Path:
     notes = {"task": header["task"], "term": found.term, "world": found.world, "step": found.step}
     recorder = Recorder(sim.model, notes=notes, labels=[f"{found.term}, world {found.world}, step {found.step}"])
     recorder.record(0.0, poses.reshape(-1, 7), series, ankles(poses), np.zeros((1, 4, 3)))
-    folder = output_dir("play", cfg.out)
-    path = save_recording(recorder.recording(), folder, "dump")
+    path = save_recording(recorder.recording(), output_dir("play", cfg.out), "dump")
     print(f"{header['task']}, iteration {header['iteration']}, seed {header['config']['train']['seed']}: {found}")
     for name in ("rewards", "observations"):
         bad = np.array(found.names[name])[~np.isfinite(found.arrays[name])]

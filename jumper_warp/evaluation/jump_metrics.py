@@ -94,8 +94,7 @@ def jump_metrics(outcome: JumpOutcome, prefix: str = "", note: str = "") -> Metr
 
     These are HEIGHT_METRICS or PLACE_METRICS; arguments: see `measure`.
     """
-    table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
-    return measure(table, outcome, None, prefix, note)
+    return measure(HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS, outcome, None, prefix, note)
 
 
 def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:

@@ -49,8 +49,7 @@ class Take:
 
     def finish(self, report: Callable[[str, str], None]) -> None:
         """Write the files in the background; report: called with title and text for each complete file."""
-        page = self.serializer.as_html()
-        threading.Thread(target=self._write, args=(page, report), daemon=True).start()
+        threading.Thread(target=self._write, args=(self.serializer.as_html(), report), daemon=True).start()
 
     def _write(self, page: str, report: Callable[[str, str], None]) -> None:
         """Write all files; the film is drawn by another process, since drawing would delay the simulation."""

@@ -76,8 +76,7 @@ def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: floa
     if height == 0.0:
         raise InputError("platform height must not be zero")
     check_number("platform edge", edge, 1.0e-6, 0.5 * size - 1.0e-6, "m")
-    row = np.where(x <= edge + 1.0e-9, 0.0, height)
-    return _heightfield(np.tile(row, (len(x), 1)), size)
+    return _heightfield(np.tile(np.where(x <= edge + 1.0e-9, 0.0, height), (len(x), 1)), size)
 
 
 def uneven(

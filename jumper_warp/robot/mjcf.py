@@ -75,8 +75,7 @@ def _add_defaults(root: Element, paw_friction: float) -> None:
     """Add the default classes "visual" and "paw" and the softness of stops to the MJCF model; paw_friction: [1]."""
     defaults = add(root, "default")
     add(defaults, "joint", solreflimit=(STIFFEST, 1))
-    visual = add(defaults, "default", class_="visual")
-    add(visual, "geom", contype="0", conaffinity="0", group="2", mass=0)
+    add(add(defaults, "default", class_="visual"), "geom", contype="0", conaffinity="0", group="2", mass=0)
     paw = add(defaults, "default", class_="paw")
     # with priority, the paw's friction and softness hold on every ground, and paws do not collide with each other
     ratio = 0.5 * model.CONTACT_DAMPING / model.CONTACT_STIFFNESS**0.5

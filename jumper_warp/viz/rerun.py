@@ -114,8 +114,7 @@ class RecordingWriter:
         """Log position, trail, contact forces and velocities of the rank-th recorded world."""
         recording = self.recording
         parent = ["scene", self.worlds[rank]]
-        offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
-        self._log(parent, offset)
+        self._log(parent, rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0]))
         points = recording.contact_points[:, rank]
         base = recording.body_poses(rank)[:, 0]
         colors = list(LEG_COLORS.values())  # four contact points are the paws

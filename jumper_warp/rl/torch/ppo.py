@@ -41,8 +41,7 @@ class Ppo(Learner):
         super().__init__(env, cfg)
         self.collector = Collector(env, cfg, self.model)
         self.rollout = self.collector.rollout
-        obs_mirror = self.symmetry and self.symmetry.obs
-        self.packer = BatchPacker(self.rollout, cfg, self.model, obs_mirror)
+        self.packer = BatchPacker(self.rollout, cfg, self.model, self.symmetry and self.symmetry.obs)
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._capture()
 
@@ -69,8 +68,7 @@ class Ppo(Learner):
         flat.gradient.zero_()
         with torch.enable_grad():
             losses = ppo_losses(self.model, packer.layout.split(rows), packer.old_log_std, cfg)
-            bonus = self._entropy_coef * losses.entropy
-            (losses.surrogate + cfg.value_coef * losses.value - bonus).backward()
+            (losses.surrogate + cfg.value_coef * losses.value - self._entropy_coef * losses.entropy).backward()
         flat.kl.copy_(losses.kl)
         all_reduce_mean(flat.all_reduced)  # gradient and divergence
         return optimiser_step(self.optimiser, self._desired_kl, cfg, losses, self._sums)
