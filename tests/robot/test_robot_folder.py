@@ -11,7 +11,11 @@ from jumper_warp.kernels.kinematics.inverse import LegLimits
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.folder import read_robot, read_urdf, robot_of, table_of, write_robot
+from jumper_warp.robot.legs import leg_dimensions
+from jumper_warp.robot.measures import filter_for
+from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.plausible import facts
 from jumper_warp.robot.values import RobotValues, described
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
@@ -104,6 +108,19 @@ def test_worlds_take_robots_in_turn_and_move_as_each_alone():
     np.testing.assert_array_equal(motions[0][::2], motions[1][::2])
     np.testing.assert_array_equal(motions[0][1::2], motions[2][1::2])
     assert np.abs(motions[0][0] - motions[0][1]).max() > 1.0e-3
+
+
+def test_tighter_stops_of_the_back_legs_limit_filter_and_reach():
+    table = table_of(load_description(), "test")
+    set_value(table["back"], "transversal_stops", [-30.0, 100.0])
+    table["BR"] = {"lateral_stops": {"value": [-40.0, 110.0], "unit": "deg", "source": "test"}}
+    robot, usual = robot_of(table), walking_filter()
+    limits = filter_for(usual, robot)
+    assert (limits.transversal.lower, limits.transversal.upper) == pytest.approx((-30.0, 100.0))
+    assert (limits.lateral.lower, limits.lateral.upper) == pytest.approx((-40.0, 110.0), abs=1.0e-3)
+    reach = facts(robot)["reach below the hip"].split(", ")
+    assert reach[0] == facts(load_description())["reach below the hip"].split(", ")[0]
+    assert reach[1].startswith(f"{leg_dimensions(robot, 'BL').depth(0.0, np.radians(100.0)):.3f} to ")
 
 
 def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
