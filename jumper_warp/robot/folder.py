@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -184,6 +184,10 @@ def robot_of(table: Json) -> RobotDescription:
         links |= _leg_links(jumper, leg, values, hull)
         joints |= _leg_joints(jumper, leg, values, (lateral, transversal))
         loops.append(_leg_loop(jumper, leg, values))
+    for motor, one in zip(of_leg, 4 * of_leg[:3], strict=True):  # relative tolerance: gains in files are rounded
+        pairs = ((motor.walking, one.jumping), (motor.jumping, one.walking))
+        if not np.allclose(*(np.multiply(astuple(a), astuple(b)) for a, b in pairs), rtol=1.0e-3, atol=0.0):
+            raise InputError(f"motors {motor.type}: ratios to the gains of {one.type} differ in walking and jumping")
     robot = replace(
         jumper,
         name=str(table.get("name", "robot")),

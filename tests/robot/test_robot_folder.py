@@ -10,7 +10,7 @@ from dynamics_oracle import differences, jumper_quantities, pinocchio_quantities
 from jumper_warp.kernels.kinematics.inverse import LegLimits
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.export import export_robot
-from jumper_warp.robot.folder import read_robot, read_urdf, robot_of, table_of, write_robot
+from jumper_warp.robot.folder import LOCKED, read_robot, read_urdf, robot_of, table_of, write_robot
 from jumper_warp.robot.legs import leg_dimensions
 from jumper_warp.robot.measures import filter_for
 from jumper_warp.robot.motors import walking_filter
@@ -133,6 +133,14 @@ def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
                 assert ours[name]["value"] == pytest.approx(theirs[name]["value"], abs=1.0e-9), name
 
 
+def test_motors_at_the_back_may_have_half_the_gains_or_a_locked_axis():
+    table = odd_table()
+    for name in ("kp_jumping", "kd_jumping", "kp_walking", "kd_walking"):
+        set_value(table["motors"]["weak"], name, 0.5 * table["motors"]["AK70-10"][name]["value"])
+    set_value(table["back"], "lateral_motor", "locked")
+    assert robot_of(table).motors[6] == LOCKED
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -147,6 +155,8 @@ def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
         (lambda table: set_value(next(iter(table["motors"].values())), "peak_torque", 0.0), "peak_torque .* positive"),
         (lambda table: set_value(table["front"], "outer_shank", 0.01), "shanks of 0.01 and 0.28 m cannot connect"),
         (lambda table: set_value(table["back"], "lateral_motor", "none"), "BL lateral_motor: no motor 'none'"),
+        (lambda table: set_value(table["motors"]["weak"], "kp_walking", 17.0), "motors weak: .* AK70-10 differ"),
+        (lambda table: set_value(table["motors"]["weak"], "kd_jumping", 0.4), "motors weak: .* AK70-10 differ"),
     ],
 )
 def test_refuses_bad_table(change, message):
