@@ -348,7 +348,8 @@ def _body_shapes(size: np.ndarray) -> tuple[Shape, ...]:
 def read_urdf(path: Path) -> RobotDescription:
     """Return the robot of a URDF, with `loop_closures.yaml` beside it, as `jumper export robot` writes them.
 
-    Links and joints have the Jumper's names; motors, gains, stops of a sum and poses are the Jumper's.
+    Links and joints have the Jumper's names; other constants of the motors, stops of a sum and poses are the
+    Jumper's. Back motors have a type of their own if their torque or speed differs from that of the front ones.
     Raises InputError: it has other legs.
     """
     jumper = load_description()
@@ -363,9 +364,10 @@ def read_urdf(path: Path) -> RobotDescription:
     for loop, text in zip(jumper.loops, points, strict=True):
         parent, child = (np.array(anchor, dtype=float) for anchor in json.loads(text))
         loops.append(replace(loop, parent_anchor=parent, child_anchor=child))
+    ends = {joint.name: {"peak_torque": joint.effort, "no_load_speed": joint.velocity} for joint in joints}
     motors = tuple(
-        replace(motor, type=f"{motor.type}", peak_torque=joint.effort, no_load_speed=joint.velocity)
-        for motor, joint in ((motor, next(j for j in joints if j.name == name))
-                             for name, motor in zip(MOTOR_JOINTS, jumper.motors, strict=True))
+        LOCKED if name.endswith("lateral") and ends[name]["no_load_speed"] == LOCKED.no_load_speed
+        else replace(motor, type=motor.type + " back" * (ends[name] != ends[f"F{name[1:]}"]), **ends[name])
+        for name, motor in zip(MOTOR_JOINTS, jumper.motors, strict=True)
     )  # fmt: skip
     return replace(jumper, name=path.stem, links=links, joints=joints, loops=tuple(loops), motors=motors)

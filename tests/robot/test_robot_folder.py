@@ -141,6 +141,18 @@ def test_motors_at_the_back_may_have_half_the_gains_or_a_locked_axis():
     assert robot_of(table).motors[6] == LOCKED
 
 
+def test_motors_of_an_exported_urdf_keep_their_torque(tmp_path):
+    table = table_of(read_urdf(export_robot("urdf", tmp_path, description=load_overlay("heavy").description)), "")
+    motors = robot_of(table).motors
+    assert [motors[i].peak_torque for i in (1, 2, 7, 11)] == pytest.approx([95.7793, 95.7793, 86.2014, 86.2014])
+    assert {motor.type for motor in motors} == {"AK80-9", "AK70-10", "AK70-10 back"}
+
+
+def test_exported_urdf_keeps_locked_axes(tmp_path):
+    read = read_urdf(export_robot("urdf", tmp_path, description=load_overlay("small_direct_drive").description))
+    assert RobotOverlay({}, robot=table_of(read, "")).description.motors[::3] == 4 * (LOCKED,)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
