@@ -52,8 +52,8 @@ class PredictiveController:
 
         assumed: environment of the robots as plans assume them, of the same task and num_envs. iterations: of the
         optimisation in a policy step. scales [1]: factors on the goal of the policy's jumps of which the best one is
-        the first plan. substeps: physics steps of a plan in a policy step. threads: as in `Rollout`.
-        longest: policy steps of the longest plan.
+        the first plan; 1 is always among them. substeps: physics steps of a plan in a policy step. threads: as in
+        `Rollout`. longest: policy steps of the longest plan.
         Raises InputError: the task is no jump, or has no SolverJumper.
         """
         robots = assumed.snapshot()
@@ -96,7 +96,7 @@ class PredictiveController:
         self.cost = np.full(self.env.num_envs, np.inf)
         touchdown = np.zeros(self.env.num_envs, dtype=int)
         actions = np.zeros((self.longest, 12, self.env.num_envs))
-        for scale in self.scales:
+        for scale in dict.fromkeys((1.0, *self.scales)):
             tried = self._policy_jump(arrays, scale)
             outlook = self.model.simulate(tried, self.start)
             better = outlook.cost < self.cost
@@ -111,7 +111,8 @@ class PredictiveController:
     def _policy_jump(self, arrays: dict[str, np.ndarray], scale: float) -> np.ndarray:
         """Return the policy's actions of a jump of the assumed robots from the command on, (longest, 12, num_envs).
 
-        `start` becomes their state at the command. arrays: of `Env.task_arrays`; scale [1]: of the goal.
+        At scale 1, the true goal, `start` becomes their state at the command. arrays: of `Env.task_arrays`; scale [1]:
+        of the goal.
         """
         place = turn_plane((arrays["goal"] - arrays["start"])[:, :2], -arrays["heading"])
         height = arrays["goal"][:, 2]
@@ -122,7 +123,7 @@ class PredictiveController:
         wait = int(arrays["command_step"].min())
         actions = []
         for i in range(wait + self.longest):
-            if i == wait:
+            if i == wait and scale == 1.0:
                 self.start = start_of(env)
                 self.model.pose = self.start.q[7:].astype(float)
             actions.append(self.policy.act(env.obs).clamp(-1.0, 1.0).cpu().numpy().T.astype(float))

@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -184,6 +184,10 @@ def robot_of(table: Json) -> RobotDescription:
         links |= _leg_links(jumper, leg, values, hull)
         joints |= _leg_joints(jumper, leg, values, (lateral, transversal))
         loops.append(_leg_loop(jumper, leg, values))
+    for motor, one in zip(of_leg, 4 * of_leg[:3], strict=True):  # relative tolerance: gains in files are rounded
+        pairs = ((motor.walking, one.jumping), (motor.jumping, one.walking))
+        if not np.allclose(*(np.multiply(astuple(a), astuple(b)) for a, b in pairs), rtol=1.0e-3, atol=0.0):
+            raise InputError(f"motors {motor.type}: ratios to the gains of {one.type} differ in walking and jumping")
     robot = replace(
         jumper,
         name=str(table.get("name", "robot")),
@@ -344,7 +348,8 @@ def _body_shapes(size: np.ndarray) -> tuple[Shape, ...]:
 def read_urdf(path: Path) -> RobotDescription:
     """Return the robot of a URDF, with `loop_closures.yaml` beside it, as `jumper export robot` writes them.
 
-    Links and joints have the Jumper's names; motors, gains, stops of a sum and poses are the Jumper's.
+    Links and joints have the Jumper's names; other constants of the motors, stops of a sum and poses are the
+    Jumper's. Back motors have a type of their own if their torque or speed differs from that of the front ones.
     Raises InputError: it has other legs.
     """
     jumper = load_description()
@@ -359,9 +364,10 @@ def read_urdf(path: Path) -> RobotDescription:
     for loop, text in zip(jumper.loops, points, strict=True):
         parent, child = (np.array(anchor, dtype=float) for anchor in json.loads(text))
         loops.append(replace(loop, parent_anchor=parent, child_anchor=child))
+    ends = {joint.name: {"peak_torque": joint.effort, "no_load_speed": joint.velocity} for joint in joints}
     motors = tuple(
-        replace(motor, type=f"{motor.type}", peak_torque=joint.effort, no_load_speed=joint.velocity)
-        for motor, joint in ((motor, next(j for j in joints if j.name == name))
-                             for name, motor in zip(MOTOR_JOINTS, jumper.motors, strict=True))
+        LOCKED if name.endswith("lateral") and ends[name]["no_load_speed"] == LOCKED.no_load_speed
+        else replace(motor, type=motor.type + " back" * (ends[name] != ends[f"F{name[1:]}"]), **ends[name])
+        for name, motor in zip(MOTOR_JOINTS, jumper.motors, strict=True)
     )  # fmt: skip
     return replace(jumper, name=path.stem, links=links, joints=joints, loops=tuple(loops), motors=motors)

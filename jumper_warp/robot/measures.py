@@ -73,7 +73,8 @@ def motors_for(cfg: MotorCfg, robot: RobotDescription) -> MotorCfg:
 def filter_for(cfg: FilterCfg, robot: RobotDescription) -> FilterCfg:
     """Return a task's command filter for a robot: its limits keep the distances from the stops that the Jumper's have.
 
-    Limits of the lateral angle are cut to the stops. Without lateral axis they are 0.
+    Where legs have different stops, the tightest ones count. Limits of the lateral angle are cut to the stops. Without
+    lateral axis they are 0.
     """
     jumper = load_description()
 
@@ -84,15 +85,15 @@ def filter_for(cfg: FilterCfg, robot: RobotDescription) -> FilterCfg:
         lower, upper = (degrees(a) - degrees(b) for a, b in zip(ours, theirs, strict=True))
         return replace(limits, lower=limits.lower + lower, upper=limits.upper + upper)
 
-    (side, thigh), (_, usual) = (
-        [(robot.joint(f"FL_{name}").lower, robot.joint(f"FL_{name}").upper) for name in ("lateral", "outer")]
-        for robot in (robot, jumper)
-    )
-    lower, upper = map(degrees, side)
+    def stops(robot: RobotDescription, name: str) -> tuple[float, float]:
+        joints = [robot.joint(f"{leg}_{name}") for leg in LEGS]
+        return max(joint.lower for joint in joints), min(joint.upper for joint in joints)
+
+    lower, upper = map(degrees, stops(robot, "lateral"))
     lateral = replace(cfg.lateral, lower=max(cfg.lateral.lower, lower), upper=min(cfg.lateral.upper, upper))
     if robot.motors[0] == LOCKED:
         lateral = LimitsCfg(-0.01, 0.01)
     return replace(
-        cfg, lateral=lateral, transversal=moved(cfg.transversal, thigh, usual),
+        cfg, lateral=lateral, transversal=moved(cfg.transversal, stops(robot, "outer"), stops(jumper, "outer")),
         sum=moved(cfg.sum, robot.transversal_sum, jumper.transversal_sum),
     )  # fmt: skip

@@ -9,22 +9,23 @@ import numpy as np
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.folder import LOCKED
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.legs import LegDimensions, leg_dimensions
+from jumper_warp.robot.legs import leg_dimensions
 from jumper_warp.robot.measures import measures_of
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.utils.errors import InputError
 
 
-def depths(leg: LegDimensions, robot: RobotDescription) -> list[float]:
-    """Return the depths [m] of a paw below the hip of equal thigh angles between the stops, where the loop closes."""
-    joint = robot.joint("FL_outer")
+def depths(leg: str, robot: RobotDescription) -> list[float]:
+    """Return the depths [m] of a paw below its hip at equal thigh angles within the stops where the loop closes."""
+    joint = robot.joint(f"{leg}_outer")
+    size = leg_dimensions(robot, leg)
     lower = max(joint.lower, 0.5 * robot.transversal_sum[0])
     upper = min(joint.upper, 0.5 * robot.transversal_sum[1])
     found = []
     for angle in np.linspace(lower, upper, 100):
         try:
-            found.append(leg.depth(0.0, angle))
+            found.append(size.depth(0.0, angle))
         except InputError:
             continue
     return found
@@ -33,7 +34,7 @@ def depths(leg: LegDimensions, robot: RobotDescription) -> list[float]:
 def facts(robot: RobotDescription) -> dict[str, str]:
     """Return weight, reach, standing height, symmetry and motors of a robot as texts, by name."""
     legs = [leg_dimensions(robot, leg) for leg in LEGS]
-    reach = [[f"{end(depths(leg, robot)):.3f}" for end in (min, max)] for leg in (legs[0], legs[2])]
+    reach = [[f"{end(depths(leg, robot)):.3f}" for end in (min, max)] for leg in ("FL", "BL")]
     mirrored = all(
         abs(getattr(left, name)) == abs(getattr(right, name))
         for left, right in zip(legs[::2], legs[1::2], strict=True)

@@ -18,7 +18,7 @@ def odd_table():
     for name, value in {"thigh": 0.16, "outer_shank": 0.27, "inner_shank": 0.29, "transversal_motor": "weak"}.items():
         set_value(table["back"], name, value)
     table["motors"]["weak"] = {name: dict(row) for name, row in table["motors"]["AK70-10"].items()}
-    for name, value in {"peak_torque": 12.4, "rotor_inertia": 3.0e-5, "kp_jumping": 12.0}.items():
+    for name, value in {"peak_torque": 12.4, "rotor_inertia": 3.0e-5, "kp_jumping": 12.0, "kp_walking": 12.0}.items():
         set_value(table["motors"]["weak"], name, value)
     table["BR"] = {"outer_shank": {"value": 0.265, "unit": "m", "source": "test"}}
     return table

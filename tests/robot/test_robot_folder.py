@@ -10,8 +10,12 @@ from dynamics_oracle import differences, jumper_quantities, pinocchio_quantities
 from jumper_warp.kernels.kinematics.inverse import LegLimits
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.export import export_robot
-from jumper_warp.robot.folder import read_robot, read_urdf, robot_of, table_of, write_robot
+from jumper_warp.robot.folder import LOCKED, read_robot, read_urdf, robot_of, table_of, write_robot
+from jumper_warp.robot.legs import leg_dimensions
+from jumper_warp.robot.measures import filter_for
+from jumper_warp.robot.motors import walking_filter
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
+from jumper_warp.robot.plausible import facts
 from jumper_warp.robot.values import RobotValues, described
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
@@ -106,6 +110,19 @@ def test_worlds_take_robots_in_turn_and_move_as_each_alone():
     assert np.abs(motions[0][0] - motions[0][1]).max() > 1.0e-3
 
 
+def test_tighter_stops_of_the_back_legs_limit_filter_and_reach():
+    table = table_of(load_description(), "test")
+    set_value(table["back"], "transversal_stops", [-30.0, 100.0])
+    table["BR"] = {"lateral_stops": {"value": [-40.0, 110.0], "unit": "deg", "source": "test"}}
+    robot, usual = robot_of(table), walking_filter()
+    limits = filter_for(usual, robot)
+    assert (limits.transversal.lower, limits.transversal.upper) == pytest.approx((-30.0, 100.0))
+    assert (limits.lateral.lower, limits.lateral.upper) == pytest.approx((-40.0, 110.0), abs=1.0e-3)
+    reach = facts(robot)["reach below the hip"].split(", ")
+    assert reach[0] == facts(load_description())["reach below the hip"].split(", ")[0]
+    assert reach[1].startswith(f"{leg_dimensions(robot, 'BL').depth(0.0, np.radians(100.0)):.3f} to ")
+
+
 def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
     robot = robot_of(odd_table())
     read = read_urdf(export_robot("urdf", tmp_path, description=robot))
@@ -114,6 +131,26 @@ def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
         for name in ours:
             if not name.endswith("_motor"):
                 assert ours[name]["value"] == pytest.approx(theirs[name]["value"], abs=1.0e-9), name
+
+
+def test_motors_at_the_back_may_have_half_the_gains_or_a_locked_axis():
+    table = odd_table()
+    for name in ("kp_jumping", "kd_jumping", "kp_walking", "kd_walking"):
+        set_value(table["motors"]["weak"], name, 0.5 * table["motors"]["AK70-10"][name]["value"])
+    set_value(table["back"], "lateral_motor", "locked")
+    assert robot_of(table).motors[6] == LOCKED
+
+
+def test_motors_of_an_exported_urdf_keep_their_torque(tmp_path):
+    table = table_of(read_urdf(export_robot("urdf", tmp_path, description=load_overlay("heavy").description)), "")
+    motors = robot_of(table).motors
+    assert [motors[i].peak_torque for i in (1, 2, 7, 11)] == pytest.approx([95.7793, 95.7793, 86.2014, 86.2014])
+    assert {motor.type for motor in motors} == {"AK80-9", "AK70-10", "AK70-10 back"}
+
+
+def test_exported_urdf_keeps_locked_axes(tmp_path):
+    read = read_urdf(export_robot("urdf", tmp_path, description=load_overlay("small_direct_drive").description))
+    assert RobotOverlay({}, robot=table_of(read, "")).description.motors[::3] == 4 * (LOCKED,)
 
 
 @pytest.mark.parametrize(
@@ -130,6 +167,8 @@ def test_exported_urdf_is_read_as_the_same_robot(tmp_path):
         (lambda table: set_value(next(iter(table["motors"].values())), "peak_torque", 0.0), "peak_torque .* positive"),
         (lambda table: set_value(table["front"], "outer_shank", 0.01), "shanks of 0.01 and 0.28 m cannot connect"),
         (lambda table: set_value(table["back"], "lateral_motor", "none"), "BL lateral_motor: no motor 'none'"),
+        (lambda table: set_value(table["motors"]["weak"], "kp_walking", 17.0), "motors weak: .* AK70-10 differ"),
+        (lambda table: set_value(table["motors"]["weak"], "kd_jumping", 0.4), "motors weak: .* AK70-10 differ"),
     ],
 )
 def test_refuses_bad_table(change, message):
