@@ -6,7 +6,7 @@ Finite differences of the motions give Jacobians; in single precision rounding w
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -72,15 +72,16 @@ class MotionReplay:
         One world for each of `robots` and `starts`, without initial contact impulses. target: motor targets [rad], one
         row for each physics step of dt [s], (lead + steps, 12); the first `lead` are sent before the start; each acts
         after the latency. rows: number of rows, `stride` physics steps apart; row 0 is the start. base: "fixed" holds
-        the base at its initial pose. gains, torque_limit [N m]: of the described motors, which the ratios of `robots`
-        scale.
+        the base at its initial pose. gains: of the described motors, which the ratios of `robots` scale. torque_limit
+        [N m]: of all described motors, at most their peak torque; scaled by the ratios of `robots` to the description.
         """
         # the last row's torques take one more step
         count = len(starts.angle)
         steps = (rows - 1) * stride + 1
         rollout, nominal = self._rollout(count, dt)
-        motors = MotorCfg.from_description(self.description, gains, torque_limit, torque_limit)
-        write_motors(rollout.parameters, motors, robots)
+        motors = MotorCfg.from_description(self.description, gains, np.inf, np.inf)  # saturated at the peak torques
+        shares = [min(1.0, torque_limit / motor.peak_torque) for motor in self.description.motors]
+        write_motors(rollout.parameters, motors, replace(robots, saturation=robots.saturation * shares))
         rollout.parameters["table"].assign(parameter_table(nominal, robots))
         rollout.hold(base == "fixed")
         com_velocity = starts.velocity + np.cross(starts.spin, rotate(starts.quaternion, robots.base_com))

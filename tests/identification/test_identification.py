@@ -84,6 +84,20 @@ def test_replay_of_another_robot_matches_its_simulation(name, damping):
     np.testing.assert_allclose(replayed.angle, simulated.angle, atol=0.05 * DEGREE)
 
 
+@pytest.mark.parametrize(
+    ("limit", "front", "back"), [(40.0, 40.0, 40.0), (90.0, 90.0, 86.2014), (200.0, 95.7793, 86.2014)]
+)
+def test_torque_limit_of_a_motion_is_that_of_all_motors_up_to_their_peaks(limit, front, back):
+    robot = load_overlay("heavy").description
+    target = np.full((30, 12), 0.4)
+    target[10:, TRANSVERSAL] = 2.0  # [rad] a step that asks for more than the peak torques
+    robots = RobotValues.nominal(1, robot)
+    robots.saturation *= 0.8
+    record = replay_plan(MotionReplay(description=robot, threads=2), Plan("hung chirp", target, limit), robots)
+    expected = 0.8 * np.tile([front, front, back, back], (2, 1)).T.ravel()  # [N m]
+    assert np.abs(record.torque[:, TRANSVERSAL, 0]).max(axis=0) == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("name", ["", *OTHER_ROBOTS])
 def test_stance_has_the_models_height(name):
     """On all paws in the nominal pose the base is as high above the ground as in the simulation's start state."""
