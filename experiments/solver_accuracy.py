@@ -72,8 +72,7 @@ def jump(args: Args, solver: SolverName, refine: int, *settings: Any) -> tuple[n
             path.append(sim.joint_q()[:, :3].copy())
             gap = max(gap, largest_gap(sim))
     positions = np.array(path)
-    apex = positions[:, :, 2].argmax(axis=0)
-    return positions[apex, np.arange(n)], positions[-1], gap
+    return positions[positions[:, :, 2].argmax(axis=0), np.arange(n)], positions[-1], gap
 
 
 def main(args: Args) -> dict[str, float]:

@@ -64,8 +64,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         from jumper_warp.evaluation.agents import AgentCfg, play_agent
         from jumper_warp.registry import make_task
 
-        cfg = parse_flags(AgentCfg, f"play {args[0]}", args[1:])
-        play_agent(make_task(args[0]), cfg)
+        play_agent(make_task(args[0]), parse_flags(AgentCfg, f"play {args[0]}", args[1:]))
         return
     if len(args) > 1 and not any(arg.startswith("-") for arg in args[:2]):
         play_together(args, modules)

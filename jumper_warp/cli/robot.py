@@ -80,6 +80,7 @@ def robot_at(source: str) -> RobotOverlay:
 
 def new(cfg: NewCfg) -> None:
     """Write the table of a robot to a folder, which must not have one; print the values that it loses, and its path."""
+    from jumper_warp.robot.description import LEGS
     from jumper_warp.robot.export import LOST
     from jumper_warp.robot.folder import FILE, read_urdf, table_of, write_robot
     from jumper_warp.robot.values import described
@@ -95,6 +96,7 @@ def new(cfg: NewCfg) -> None:
         types = [motor.type for motor in robot.description.motors]
         kinds = {name: len({*zip(types, row, strict=False)}) for name, row in robot.values.items() if len(row) == 12}
         lost = [name for name in robot.values if name in LOST[FILE] or kinds.get(name, 0) > len({*types})]
+        lost += [leg for leg in LEGS if robot.values and leg in (robot.robot or {})]
         lost += ["randomization"] if robot.randomization else []
         if lost:
             print(f"{FILE} has no place for these values of {cfg.like}, or one a type of motor: {', '.join(lost)}")

@@ -89,6 +89,8 @@ def unsafe_reason(plan: Plan, record: Record, robot: RobotDescription) -> str:
 class Scorer:
     """Scorer of candidate motions, by the Fisher information of their simulated recordings about the parameters."""
 
+    torque = False  # Whether the recordings have motor torques
+
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
         """Prepare to rate motions by what they reveal about `parameters` under sensor `noise`; replay: simulation."""
         self.parameters = parameters
@@ -109,7 +111,7 @@ class Scorer:
         The initial state is marginalised: what the motion reveals about both at once does not count. Information is the
         inverse of the covariance that a fit to this motion alone would have; it adds up over motions.
         """
-        motion = measure(plan, plan.kind, record, self._nominal, None, base_every=1)
+        motion = measure(plan, plan.kind, record, self._nominal, None, torque=self.torque)
         problem = MotionResiduals(motion, self.parameters, self.noise, self.replay.description)
         size = len(self.parameters)
         linear = problem.linearise(self.replay, np.zeros(size), np.zeros(problem.start_size), 1.0e-3)

@@ -140,11 +140,10 @@ def measure(
     noise: NoiseLevels | None = None,
     *,
     torque: bool = False,
-    base_every: int = 2,
 ) -> RecordedMotion:
     """Convert a simulated motion to the recording that sensors with offsets and noise would make of it.
 
-    Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion, with
+    Motors at 240 Hz, the base's pose every second row. name: name of the motion. record: true motion, with
     arrays (rows, values, worlds), of which world 0 is measured. robots: its sensor offsets. rng: random numbers of the
     noise, None for no noise. noise: its standard deviations; that of the orientation is of a rotation vector [rad],
     world axes. torque: whether motor torques are recorded.
@@ -161,7 +160,7 @@ def measure(
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
         quaternion = multiply(from_rotation_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
-    unmeasured = (np.arange(rows) % base_every != 0)[:, None]
+    unmeasured = (np.arange(rows) % 2 != 0)[:, None]
     values["position"], quaternion = (np.where(unmeasured, math.nan, x) for x in (values["position"], quaternion))
     if not torque:
         del values["torque"]

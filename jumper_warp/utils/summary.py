@@ -64,8 +64,7 @@ def print_summary(
         conditions = (f"{name} {format_value(value)}" for name, value in report.conditions.items())
         print(textwrap.fill("; ".join(conditions), WIDTH))
     if main:
-        table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
-        print_table(table)
+        print_table(_columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper))
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
     hints += [f"--verbose prints {len(metrics)} metrics"] if len(metrics) > len(main) else []
     end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])

@@ -10,7 +10,8 @@ from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.conditions import env_of_recipe
 from jumper_warp.evaluation.run import EvaluationArgs, torque_limit
 from jumper_warp.policies.policy import Policy
-from jumper_warp.robot.folder import read_robot
+from jumper_warp.robot.description import load_description
+from jumper_warp.robot.folder import read_robot, table_of
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.training import make_env
 from jumper_warp.utils.output import read_values
@@ -66,6 +67,14 @@ def test_new_folder_of_an_overlay_names_the_values_that_it_loses(tmp_path, capsy
     RobotOverlay(values, {"gains": (0.9, 1.1)}).save(tmp_path / "overlay.json")
     robot(["new", str(tmp_path / "mine"), "--from", str(tmp_path / "overlay.json")])
     assert capsys.readouterr().out.splitlines()[0].endswith("of motor: latency, armature, randomization")
+
+
+def test_new_folder_of_an_overlay_names_the_legs_whose_own_values_it_loses(tmp_path, capsys):
+    table = table_of(load_description(), "Jumper")
+    table["FR"] = {"outer_shank_mass": {**table["front"]["outer_shank_mass"], "value": 1.0}}
+    RobotOverlay({"base_mass": (7.0,)}, robot=table).save(tmp_path / "overlay.json")
+    robot(["new", str(tmp_path / "mine"), "--from", str(tmp_path / "overlay.json")])
+    assert capsys.readouterr().out.splitlines()[0].endswith("of motor: FR")
 
 
 def test_new_folder_of_a_robot_is_checked_and_drawn(tmp_path, capsys):

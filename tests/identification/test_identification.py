@@ -231,6 +231,17 @@ def test_open_directions_report_that_masses_and_gains_share_a_scale():
     assert any("share a scale: add a weighed mass" in line for line in lines), lines
 
 
+def test_recorded_torques_reveal_gains_apart_from_masses(replay):
+    parameters, plan = jumper_parameters(), sample_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
+    scorer, place = Scorer(parameters, replay=replay), parameters.names.index("kp/FL_inner")
+    record = scorer.record(plan)
+    stds = []  # [1] of kp after the fit, relative to that before
+    for scorer.torque in (False, True):
+        information = scorer.information(plan, record)
+        stds.append(np.linalg.inv(information + np.eye(len(parameters)))[place, place] ** 0.5)
+    assert stds[1] < 0.5 * stds[0] < 0.5
+
+
 def test_identify_refuses_a_recording_given_twice(standing):
     motion = standing[0].motion
     copy = replace(motion, name="copy", time=motion.time + 5.0, position=None, angle=motion.angle + 1.0e-12)
