@@ -96,7 +96,7 @@ class Scorer:
         self.parameters = parameters
         self.noise = noise or NoiseLevels()
         self.replay = replay or MotionReplay()
-        self._nominal = parameters.robots(np.zeros((1, len(parameters))))
+        self._nominal = parameters.robots(np.zeros((1, len(parameters))), self.replay.description)
 
     def record(self, plan: Plan) -> Record:
         """Simulate the nominal robot under the motor targets of a plan, and return its motion.

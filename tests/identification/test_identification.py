@@ -231,6 +231,13 @@ def test_open_directions_report_that_masses_and_gains_share_a_scale():
     assert any("share a scale: add a weighed mass" in line for line in lines), lines
 
 
+def test_scorer_of_another_robot_simulates_this_robot():
+    robot = load_overlay("heavy").description
+    scorer = Scorer(jumper_parameters(["motors"], robot), replay=MotionReplay(description=robot))
+    for quantity, described in vars(RobotValues.nominal(1, robot)).items():
+        np.testing.assert_allclose(getattr(scorer._nominal, quantity), described, rtol=1e-12, err_msg=quantity)
+
+
 def test_recorded_torques_reveal_gains_apart_from_masses(replay):
     parameters, plan = jumper_parameters(), sample_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
     scorer, place = Scorer(parameters, replay=replay), parameters.names.index("kp/FL_inner")
