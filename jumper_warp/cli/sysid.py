@@ -198,8 +198,8 @@ def excite(cfg: ExciteCfg) -> None:
     robots, robot = overlay.robots(), overlay.description
     parameters = jumper_parameters(split_names(cfg.params), robot)
     configure_device("cpu", cfg.threads)
-    scorer = Scorer(parameters, cfg.noise, MotionReplay(description=robot, device="cpu", threads=cfg.threads))
-    scorer.torque = cfg.record_torque
+    replay = MotionReplay(description=robot, device="cpu", threads=cfg.threads)
+    scorer = Scorer(parameters, cfg.noise, replay, cfg.record_torque)
     chosen = choose(scorer, KINDS * cfg.num_sets, candidates=cfg.num_candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.no_noise else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)

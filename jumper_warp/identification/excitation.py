@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,17 +86,18 @@ def unsafe_reason(plan: Plan, record: Record, robot: RobotDescription) -> str:
     return ""
 
 
+@dataclass(eq=False)
 class Scorer:
     """Scorer of candidate motions, by the Fisher information of their simulated recordings about the parameters."""
 
-    torque = False  # Whether the recordings have motor torques
+    parameters: ParameterSet
+    noise: NoiseLevels = field(default_factory=NoiseLevels)
+    replay: MotionReplay = field(default_factory=MotionReplay)
+    torque: bool = False  # Whether the recordings have motor torques
 
-    def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
-        """Prepare to rate motions by what they reveal about `parameters` under sensor `noise`; replay: simulation."""
-        self.parameters = parameters
-        self.noise = noise or NoiseLevels()
-        self.replay = replay or MotionReplay()
-        self._nominal = parameters.robots(np.zeros((1, len(parameters))), self.replay.description)
+    def __post_init__(self) -> None:
+        """Prepare the robot as described."""
+        self._nominal = self.parameters.robots(np.zeros((1, len(self.parameters))), self.replay.description)
 
     def record(self, plan: Plan) -> Record:
         """Simulate the nominal robot under the motor targets of a plan, and return its motion.

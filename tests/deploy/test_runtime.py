@@ -112,14 +112,19 @@ def test_dry_run_keeps_the_motors_off_and_its_log_replays(make_robot, bundle, tm
         motions_of_log(tmp_path / "log")
 
 
+def log_standing_up(robot, bundle, folder, wait):
+    """Write the log of a robot that waits some ticks for the confirmation, and begins to stand up."""
+    log = Log(folder, bundle, 480, capture=True)
+    robot.runtime.listener = log.tick
+    robot.enable(wait)
+    robot.run(360, Request.CONFIRM)
+    log.close()
+
+
 def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_path):
     """While the robot waits for the confirmation, it only damps."""
     robot = make_robot()
-    log = Log(tmp_path / "log", bundle, 480, capture=True)
-    robot.runtime.listener = log.tick
-    robot.enable(480)
-    robot.run(360, Request.CONFIRM)
-    log.close()
+    log_standing_up(robot, bundle, tmp_path / "log", 480)
     (motion,) = motions_of_log(tmp_path / "log")
     assert len(motion.time) == 360 - 1 and (motion.base, motion.gains, motion.torque_limit) == ("free", "jumping", 18.0)
     given = {"base": "fixed", "gains": "walking", "torque_limit": 12.0}
@@ -133,11 +138,7 @@ def test_motions_of_a_log_have_the_gains_that_were_sent(make_robot, bundle, tmp_
 
 def test_log_is_shown_with_its_simulation_from_the_first_estimate_on(make_robot, bundle, tmp_path, capsys):
     robot = make_robot()
-    log = Log(tmp_path / "log", bundle, 480, capture=True)
-    robot.runtime.listener = log.tick
-    robot.enable(200)
-    robot.run(360, Request.CONFIRM)
-    log.close()
+    log_standing_up(robot, bundle, tmp_path / "log", 200)
     ticks = read_log(tmp_path / "log")[0].copy()
     ticks[:240]["position"] = 0.0
     assert simulated_again(ticks[:2], 480)[0, 2] > 0.3  # [m] at the default height

@@ -240,11 +240,10 @@ def test_scorer_of_another_robot_simulates_this_robot():
 
 def test_recorded_torques_reveal_gains_apart_from_masses(replay):
     parameters, plan = jumper_parameters(), sample_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
-    scorer, place = Scorer(parameters, replay=replay), parameters.names.index("kp/FL_inner")
-    record = scorer.record(plan)
-    stds = []  # [1] of kp after the fit, relative to that before
-    for scorer.torque in (False, True):
-        information = scorer.information(plan, record)
+    place, stds = parameters.names.index("kp/FL_inner"), []  # [1] of kp after the fit, relative to that before
+    for torque in (False, True):
+        scorer = Scorer(parameters, replay=replay, torque=torque)
+        information = scorer.information(plan, scorer.record(plan))
         stds.append(np.linalg.inv(information + np.eye(len(parameters)))[place, place] ** 0.5)
     assert stds[1] < 0.5 * stds[0] < 0.5
 
