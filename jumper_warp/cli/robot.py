@@ -99,7 +99,7 @@ def new(cfg: NewCfg) -> None:
         lost += [leg for leg in LEGS if robot.values and leg in (robot.robot or {})]
         lost += ["randomization"] if robot.randomization else []
         if lost:
-            print(f"{FILE} has no place for these values of {cfg.like}, or one a type of motor: {', '.join(lost)}")
+            print(f"{FILE} lacks these values of {cfg.like}, or has one a type of motor: {', '.join(lost)}")
     print(write_robot(cfg.out, {**table, "name": cfg.out.name}))
 
 

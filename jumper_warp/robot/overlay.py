@@ -5,7 +5,6 @@ An identification writes one for each real robot, which differs a little from it
 
 from __future__ import annotations
 
-import copy
 import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 
 from jumper_warp.robot import bounds
 from jumper_warp.robot.bounds import Range
-from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.description import LEGS, RobotDescription, load_description
 from jumper_warp.robot.folder import FILE, read_robot, robot_of, stretch, table_of
 from jumper_warp.robot.folder import SCHEMA as ROBOT_SCHEMA
 from jumper_warp.robot.values import RobotValues
@@ -128,13 +127,16 @@ class RobotOverlay:
         A link of another length keeps its mass; its centre of mass and its inertia grow with the length.
         """
         lengths = {name: self.values[name] for name in LENGTHS if name in self.values}
+        described = load_description() if self.robot is None else robot_of(self.robot)
         if not lengths:
-            return load_description() if self.robot is None else robot_of(self.robot)
-        table = table_of(load_description(), "Jumper") if self.robot is None else copy.deepcopy(self.robot)
+            return described
+        table = dict(table_of(described, "Jumper") if self.robot is None else self.robot)
         for name, values in lengths.items():
-            for end, value in zip(("front", "back"), 2 * values, strict=False):
+            for section in sorted(table.keys() & {"front", "back", *LEGS}):  # single legs before their end
+                end, value = ("back", values[-1]) if section[0] in "Bb" else ("front", values[0])
+                table[section] = {**table[end], **table[section]}
                 for quantity in LENGTHS[name]:
-                    stretch(table[end], quantity, value)
+                    stretch(table[section], quantity, value)
         return robot_of({**table, "name": f"{table['name']} with other lengths"})
 
     @property

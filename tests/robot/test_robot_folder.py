@@ -84,6 +84,24 @@ def test_overlay_of_lengths_changes_the_geometry_and_keeps_masses(tmp_path):
     assert not overlay.is_jumper and RobotOverlay({"base_mass": (7.93,)}).is_jumper
 
 
+def test_overlay_of_lengths_stretches_legs_with_values_of_their_own():
+    """FR's thigh is 0.02 m longer, and the mass of BL's outer thigh at the hip; both scale with their leg."""
+    table = table_of(load_description(), "Jumper")
+    usual = table["front"]["thigh"]["value"]
+    table["FR"] = {"thigh": {**table["front"]["thigh"], "value": usual + 0.02}}
+    table["BL"] = {"outer_thigh_com": {**table["back"]["outer_thigh_com"], "value": [0.0, 0.0, -0.01]}}
+    robot = RobotOverlay({"thigh_length": (2.0 * usual,)}, robot=table).description
+    knees = [robot.joint(f"{leg}_outer_knee").origin[2] for leg in ("FL", "FR", "BL", "BR")]
+    assert knees == pytest.approx(4 * [-2.0 * usual])
+    coms = [robot.link(f"{leg}_outer_thigh").com[2] for leg in ("FL", "FR", "BL")]
+    assert coms[1] / coms[0] == pytest.approx(usual / (usual + 0.02)) and coms[2] == pytest.approx(-0.02)
+
+
+def test_overlay_of_lengths_of_a_robot_without_legs_names_the_section():
+    with pytest.raises(InputError, match="section 'front' is missing"):
+        RobotOverlay({"thigh_length": (0.2,)}, robot={**odd_table(), "front": None})
+
+
 def test_motors_of_the_back_legs_have_their_own_torque_and_gains():
     overlay = RobotOverlay({}, robot=odd_table())
     sim = Simulation(1, robot=overlay, device="cpu", visuals=False)
