@@ -32,6 +32,16 @@ def missed_goal(robot: RobotView, state: JumpState, tolerance: float) -> bool:
 
 
 @wp.func
+def short_jump(robot: RobotView, state: JumpState, margin: float, fraction: float) -> bool:
+    """Terminate at touchdown if the base is more than margin [m] + fraction · (distance of the goal) off, horizontally.
+
+    The distance is from the start of the jump. Else a robot could hop and then walk to the goal.
+    """
+    distance = wp.length(wp.vec2(state.goal[0] - state.start[0], state.goal[1] - state.start[1]))
+    return state.touched_down == 1 and wp.length(goal_offset(robot, state)) > margin + fraction * distance
+
+
+@wp.func
 def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float, height: float) -> bool:
     """Terminate `steps` policy steps after takeoff if the ballistic landing is more than `tolerance` [m] off the goal.
 

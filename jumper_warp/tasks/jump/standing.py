@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from jumper_warp.kernels.jump import rewards, terminations
+from jumper_warp.robot.motors import JUMP_TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, StartProbability, cross_levels
 from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
@@ -21,6 +22,7 @@ from jumper_warp.tasks.units import DEG, SECOND
 
 STANCE = 12.0 * DEG  # [rad] of the thighs from the default pose: a base height of 0.35 m
 LOWEST_STANCE = 0.28  # [m] Base height below which the robot crouches
+THIGH_LIMIT = 110.0  # [deg] Largest target of thighs, which stand straight up at 180 deg
 HOLD = 5.0  # [s] Time after touchdown for which an evaluated robot must stand
 FRICTION = RandomizationCfg(static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
 """Random robots whose paws also stand on slippery ground."""
@@ -107,6 +109,9 @@ def horizontal_jump_standing() -> TaskCfg:
             RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10, scale_by_dt=False),
             RewardTerm(rewards.settled, 600.0, first=0.9 * SECOND, last=1.1 * SECOND, std=0.12),
         ),
+        terminations=(*task.terminations, TerminationTerm(terminations.short_jump, margin=0.08, fraction=0.35)),
+        curriculum=task.curriculum.replace(promote_after=1),
+        command_filter=replace(task.command_filter, transversal=replace(JUMP_TRANSVERSAL, upper=THIGH_LIMIT)),
         levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
         randomization=replace(FRICTION, latency=(0.0, 20.0), zero_latency_probability=0.1),
         evaluation=PlaceEvaluation(hold=HOLD),
