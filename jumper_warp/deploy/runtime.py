@@ -218,9 +218,8 @@ class Runtime:
             self.skill.wanted = np.clip(values, self.skill.lowest, self.skill.highest)
         elif request == Request.WALK and state == State.HOLD and State.WALK in self.skills:
             self._enter(State.WALK, values)
-        elif request in JUMP_OF_REQUEST and state in (State.WALK, State.HOLD):
-            if JUMP_OF_REQUEST[request] in self.skills:
-                self.pending = (JUMP_OF_REQUEST[request], values)
+        elif JUMP_OF_REQUEST.get(request) in self.skills and state in (State.WALK, State.HOLD):
+            self.pending = (JUMP_OF_REQUEST[request], values)
         pending, due = self.pending, self._time >= self._due
         if pending and due and (state == State.HOLD or self.skill.ready_to_jump(self.motion)):
             self._enter(*pending)

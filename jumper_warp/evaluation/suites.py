@@ -344,15 +344,9 @@ class Farthest(Suite):
             "flown by the base": values["bin_distance_flown_mean_m"].value,
         }
         plot_distances(
-            run.folder / "max_jump.png",
-            [*bins],
-            successes,
-            errors,
-            covered=covered,
-            reliable=RELIABLE,
-            published=PUBLISHED,
-            conditions=conditions,
-        )
+            run.folder / "max_jump.png", [*bins], successes, errors, covered=covered, reliable=RELIABLE,
+            published=PUBLISHED, conditions=conditions,
+        )  # fmt: skip
         return values
 
 

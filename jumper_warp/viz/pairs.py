@@ -85,11 +85,10 @@ def _labelled(recording: Recording, label: str) -> dict[str, np.ndarray]:
 
 def write_pictures(recording: Recording, path: Path, **options: Any) -> Path:
     """Write the composite pictures of all robots of a recording, one below the other; options: of `write_picture`."""
-    images = []
-    for rank in range(len(recording.worlds)):
-        images.append(
-            np.array(Image.open(write_picture(recording, path, rank=rank, title=recording.label(rank), **options)))
-        )
+    images = [
+        np.array(Image.open(write_picture(recording, path, rank=rank, title=recording.label(rank), **options)))
+        for rank in range(len(recording.worlds))
+    ]
     data = io.BytesIO()
     Image.fromarray(np.concatenate(images)).save(data, "png")
     write_atomically(path, data.getvalue())

@@ -394,15 +394,9 @@ def make_reverse_kernel(module: str, by_parameters: bool) -> wp.Kernel:
             if row * timing.every == t * timing.substeps:
                 for k in range(legs.shape[0]):
                     by_filter = command_adjoint.filter_gradient(
-                        commands,
-                        actuation,
-                        t,
-                        k,
-                        world,
-                        record.angles[world, 0, k],
-                        record.rates[world, 0, k],
+                        commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k],
                         gradients,
-                    )
+                    )  # fmt: skip
                     add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
             add_motor_rows(legs, cotangent, row, world)
         add_com(sums, model.table[BASE, world], com, entries.com)

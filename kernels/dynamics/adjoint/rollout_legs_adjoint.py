@@ -217,14 +217,11 @@ def reverse_legs_kernel(
             slopes = leg_record.get_slopes(record, start_entry + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)
         entries = rollout_adjoint.add_row_cotangent(
-            rollout_adjoint.load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com),
-            cotangent,
-            row,
+            rollout_adjoint.load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com), cotangent, row,
             world,
-        )
-        if index < count:
-            if leg == 0:
-                rollout_adjoint.add_wrench(gradients, t, world, adj.force, adj.moment)
+        )  # fmt: skip
+        if index < count and leg == 0:
+            rollout_adjoint.add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
                 commands, actuation, t, leg, world, leg_record.get_vec(record, start_entry, ANGLES, world, leg),
