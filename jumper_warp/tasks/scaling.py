@@ -113,7 +113,8 @@ def scaled(task: TaskCfg, robot: RobotDescription, ours: Measures, theirs: Measu
         walking = {} if not hasattr(settings, "gait") else {"height": "height"}
         settings = of_fields(settings, OF_FIELD | walking)
         if hasattr(settings, "ground"):
-            limit = min(settings.transversal_limit, command_filter.transversal.upper)
+            tighter = min(command_filter.transversal.upper - task.command_filter.transversal.upper, 0.0)
+            limit = max(settings.transversal_limit + tighter, 0.0)
             settings = replace(settings, ground=of_fields(settings.ground), transversal_limit=limit)
         if ours.locked:
             settings = on_fixed_paws(settings, ours)

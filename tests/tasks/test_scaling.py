@@ -91,5 +91,6 @@ def test_starts_stay_within_the_stops_of_the_robot():
     stop = math.radians(120.0)
     joints = tuple(replace(joint, upper=min(joint.upper, stop)) for joint in jumper.joints)
     stiff = scaled(task, replace(jumper, joints=joints), jumper_measures(), jumper_measures())
-    assert stiff.reset.settings.transversal_limit == stiff.command_filter.transversal.upper == pytest.approx(120.0)
-    assert task.reset.settings.transversal_limit == 130.0
+    limits = stiff.reset.settings.transversal_limit, stiff.command_filter.transversal.upper
+    assert limits == pytest.approx((110.0, 90.0))  # as far from the stops as the Jumper's
+    assert (task.reset.settings.transversal_limit, task.command_filter.transversal.upper) == (130.0, 110.0)
