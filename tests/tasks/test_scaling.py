@@ -74,6 +74,23 @@ def test_lengths_and_speeds_of_a_small_robots_rewards_are_below_the_jumpers():
     assert smallest[0] / smallest[1] == pytest.approx(1.21, abs=0.01)
 
 
+KEPT = {
+    "angle", "duty", "fine_weight", "first", "flight", "fraction", "idle_steps", "landing_steps", "last", "limit",
+    "rotation", "settle", "shift", "stance", "start_steps", "std", "std_ang_vel", "std_lateral", "std_posture",
+    "std_variance", "steepness", "steps", "threshold", "tolerance", "waiting_scale", "weight", "yaw",
+}  # fmt: skip
+"""Names of numbers that are no lengths, speeds or forces, at least in some terms."""
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_terms_of_another_robot_have_its_lengths(task):
+    ours, theirs = (make_task(task, robot) for robot in (load_overlay("heavy"), None))
+    for terms in ("rewards", "terminations"):
+        for our, their in zip(getattr(ours, terms), getattr(theirs, terms), strict=True):
+            kept = {name for name, number in our.numbers.items() if number and number == their.numbers[name]}
+            assert kept <= KEPT, our.name
+
+
 def test_robot_without_lateral_axis_starts_level_and_walks_ahead_and_back_only():
     task = make_task("velocity-flat", load_overlay("small_direct_drive"))
     settings = task.reset.settings
