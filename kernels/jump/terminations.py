@@ -38,7 +38,7 @@ def short_jump(robot: RobotView, state: JumpState, margin: float, fraction: floa
     The distance is from the start of the jump. Else a robot could hop and then walk to the goal.
     """
     distance = wp.length(wp.vec2(state.goal[0] - state.start[0], state.goal[1] - state.start[1]))
-    return state.touched_down == 1 and wp.length(goal_offset(robot, state)) > margin + fraction * distance
+    return missed_goal(robot, state, margin + fraction * distance)
 
 
 @wp.func
