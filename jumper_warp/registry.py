@@ -136,7 +136,7 @@ NOMINAL = "--no-randomize --no-noise --history 1 --ppo.hidden 128 64 64"
 """Flags of trainings on two CPU cores: no randomisation, no noise, a short observation and a small network."""
 LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 1 --ppo.desired-kl 0.02"
 LAPTOP_WALK = f"{NOMINAL} --num-envs 512 --ppo.desired-kl 0.02 --ppo.minibatches 4"
-NEARER = "--env.command-filter.transversal.upper 140 --env.terminations.short-jump.margin 9" + "".join(
+NEARER = "--env.command-filter.transversal.upper 140 --env.terminations.walked.margin 9" + "".join(
     f" --env.levels.{i}.goal-lower -0.9 -0.9 0 --env.levels.{i}.goal-upper 1.7 0.9 0" for i in (10, 11)
 )
 """Flags of a jump from a stance: thighs up to 140°, steps to the goal, goals of at most 1.7 m in the last levels."""

@@ -32,7 +32,7 @@ OF_TERM = {
     "lin_vel_z_l2": {"weight": "1/speed^2"}, "slip": {"weight": "1/speed^2"}, "touchdown": {"weight": "1/speed^2"},
     "foot_clearance": {"weight": "1/(leg^2 speed)"}, "touchdown_tracking": {"std": "gain"},
     "squat": {"std": "height"}, "shallow_squat": {"tolerance": "height"}, "settled": {"std": "speed"},
-    "tracking": {"std": "gain"}, "estimated_tracking": {"std": "gain"}, "short_jump": {"margin": "gain"},
+    "tracking": {"std": "gain"}, "estimated_tracking": {"std": "gain"}, "walked": {"margin": "gain"},
     "jump_height": {"std": "gain", "scale": "gain"}, "estimated_jump_height": {"std": "gain", "scale": "gain"},
 }  # fmt: skip
 """Measures of numbers of a term by the term's name, which take precedence over BY_NAME."""

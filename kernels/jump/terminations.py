@@ -32,16 +32,6 @@ def missed_goal(robot: RobotView, state: JumpState, tolerance: float) -> bool:
 
 
 @wp.func
-def short_jump(robot: RobotView, state: JumpState, margin: float, fraction: float) -> bool:
-    """Terminate at touchdown if the base is more than margin [m] + fraction · (distance of the goal) off, horizontally.
-
-    The distance is from the start of the jump. Else a robot could hop and then walk to the goal.
-    """
-    distance = wp.length(wp.vec2(state.goal[0] - state.start[0], state.goal[1] - state.start[1]))
-    return missed_goal(robot, state, margin + fraction * distance)
-
-
-@wp.func
 def predicted_miss(robot: RobotView, state: JumpState, tolerance: float, steps: float, height: float) -> bool:
     """Terminate `steps` policy steps after takeoff if the ballistic landing is more than `tolerance` [m] off the goal.
 
@@ -89,6 +79,17 @@ def left_stance(robot: RobotView, state: JumpState, distance: float) -> bool:
     A robot must jump to its goal, and not walk there.
     """
     return state.phase == STANCE and moved_away(robot, state, distance)
+
+
+@wp.func
+def walked(robot: RobotView, state: JumpState, margin: float, fraction: float) -> bool:
+    """Terminate if the base moves farther than a limit from the start in stance, or touches down farther from the goal.
+
+    Distances are horizontal. The limit is margin [m] + fraction · (distance from start to goal). Else a robot could
+    walk, hop, and walk on.
+    """
+    limit = margin + fraction * wp.length(wp.vec2(state.goal[0] - state.start[0], state.goal[1] - state.start[1]))
+    return left_stance(robot, state, limit) or missed_goal(robot, state, limit)
 
 
 @wp.func

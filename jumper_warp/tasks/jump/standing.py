@@ -109,7 +109,7 @@ def horizontal_jump_standing() -> TaskCfg:
             RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10, scale_by_dt=False),
             RewardTerm(rewards.settled, 600.0, first=0.9 * SECOND, last=1.1 * SECOND, std=0.12),
         ),
-        terminations=(*task.terminations, TerminationTerm(terminations.short_jump, margin=0.08, fraction=0.35)),
+        terminations=(*task.terminations, TerminationTerm(terminations.walked, margin=0.08, fraction=0.25)),
         curriculum=task.curriculum.replace(promote_after=1),
         command_filter=replace(task.command_filter, transversal=replace(JUMP_TRANSVERSAL, upper=THIGH_LIMIT)),
         levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),

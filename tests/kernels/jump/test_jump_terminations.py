@@ -83,9 +83,12 @@ TERMS = [  # (term, numbers, rows (whether it holds, robot, episode), phases in 
     ("missed_goal", {"tolerance": 0.5}, at("touched_down", [
         (miss > 0.5, {"pos": (1.0 - 0.6 * miss, 2.0 + 0.8 * miss, 0.9)}, GOAL | {"phase": L})
         for miss in (0.49, 0.51)])),
-    ("short_jump", {"margin": 0.1, "fraction": 0.4}, at("touched_down", [  # 1.5 m to the goal: at most 0.7 m off
+    ("walked", {"margin": 0.1, "fraction": 0.4}, at("touched_down", [  # 1.5 m from start to goal: at most 0.7 m off
         (miss > 0.7, {"pos": (1.0 - 0.6 * miss, 2.0 + 0.8 * miss, 0.9)}, GOAL | {"phase": L, "start": (0.1, 0.8, 0.3)})
         for miss in (0.69, 0.71)])),
+    ("walked", {"margin": 0.1, "fraction": 0.4}, [
+        (way > 0.7, {"pos": (0.1 - 0.6 * way, 0.8 + 0.8 * way, 0.9)}, GOAL | {"start": (0.1, 0.8, 0.3)})
+        for way in (0.69, 0.71)], [S]),
     ("predicted_miss", PREDICTED, [  # decided once, 0.1 s after takeoff
         (miss > 0.55 and steps == 6, RISING, {"phase_steps": steps, "goal": (0.7 + 0.6 * miss, -0.8 * miss, 0.0)})
         for miss in (0.54, 0.56) for steps in range(12)], [F]),
