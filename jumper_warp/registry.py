@@ -173,10 +173,6 @@ TASKS: dict[str, TaskEntry] = {
     "horizontal-jump-mars": TaskEntry(f"{MARS}horizontal_jump_mars", PLACES, ("Olympus-Jump-Mars",),
                                       about="jump to a place, Mars"),
     "horizontal-jump-mars-loose": TaskEntry(f"{MARS}horizontal_jump_mars_loose", PLACES, about="jump farther, Mars"),
-    "vertical-jump-mars-stance": TaskEntry(f"{STANDING}vertical_jump_mars_standing", FROM_STANCE, max_iterations=6000,
-                                           about="stand, and jump to a height, Mars"),
-    "horizontal-jump-mars-stance": TaskEntry(f"{STANDING}horizontal_jump_mars_standing", PLACES, max_iterations=8500,
-                                             about="stand, and jump to a place, Mars"),
     "velocity-flat": TaskEntry(
         f"{WALK}.flat:velocity_flat", WALKING, ("Olympus-Walk",), SCORE, "walk on level ground",
         {"laptop": f"{LAPTOP_WALK} --ppo.final-desired-kl 0.001 --ppo.entropy-coef 0.006 --max-iterations 1800"},

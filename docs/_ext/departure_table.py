@@ -30,8 +30,6 @@ BASES = {
     "horizontal-jump-standing": "horizontal-jump", "vertical-jump-mars": "vertical-jump",
     "vertical-jump-mars-loose": "vertical-jump-mars", "horizontal-jump-mars": "horizontal-jump",
     "horizontal-jump-mars-loose": "horizontal-jump-mars", "velocity-rough": "velocity-flat",
-    "vertical-jump-mars-stance": "vertical-jump-mars-loose",
-    "horizontal-jump-mars-stance": "horizontal-jump-mars-loose",
     "velocity-mars": "velocity-rough", "velocity-trot": "velocity-flat", "attitude": "",
 }  # fmt: skip
 """Task whose numbers a variant has, except in its own rows; empty: none."""

@@ -10,10 +10,11 @@ from dataclasses import replace
 from typing import Any
 
 from jumper_warp.kernels.jump import rewards, terminations
+from jumper_warp.robot.motors import JUMP_TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.jump.cfg import Level, StartProbability, cross_levels
+from jumper_warp.tasks.jump.evaluation import HeightEvaluation, PlaceEvaluation
 from jumper_warp.tasks.jump.horizontal import NEAREST, NEXT_JUMP_PROBABILITY, horizontal_jump
-from jumper_warp.tasks.jump.mars import FARTHER, horizontal_jump_mars_loose, vertical_jump_mars_loose
 from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
@@ -44,48 +45,33 @@ def standing(task: TaskCfg, start_steps: float, long_wait_probability: float, st
     return task.with_terms("terminations", success={"steps": 3.0 * SECOND})
 
 
-def to_heights(task: TaskCfg, name: str, farther: float = 1.0) -> TaskCfg:
-    """Return a task of vertical jumps from a stance, with a squat as deep as the height needs, and little drift.
-
-    task: of jumps from a crouch; farther: factor on lengths of landing errors.
-    """
+def vertical_jump_standing() -> TaskCfg:
+    """Return the task of a vertical jump from a stance, with a squat as deep as the height needs, and little drift."""
     starts = StartProbability(0.45, default=0.15, in_flight=0.20, after_landing=0.10, pushing=0.10)
-    task = standing(task, 0.3 * SECOND, 0.2, starts)
+    task = standing(vertical_jump(), 0.3 * SECOND, 0.2, starts)
     task = replace(
         task,
-        name=name,
+        name="vertical-jump-standing",
         rewards=(
             *task.rewards,
             RewardTerm(rewards.squat, 100.0, std=0.03, scale_by_dt=False, **SQUAT),
-            RewardTerm(rewards.tracking, 40.0, std_wide=0.15 * farther, std_fine=0.03 * farther, fine_weight=0.6),
-            RewardTerm(rewards.touchdown_tracking, 120.0, std=0.05 * farther, scale_by_dt=False),
+            RewardTerm(rewards.tracking, 40.0, std_wide=0.15, std_fine=0.03, fine_weight=0.6),
+            RewardTerm(rewards.touchdown_tracking, 120.0, std=0.05, scale_by_dt=False),
         ),
         terminations=(
             *task.terminations,
             TerminationTerm(terminations.shallow_squat, tolerance=0.04, **SQUAT),
             TerminationTerm(terminations.turned_touchdown, rotation=25.0 * DEG, yaw=15.0 * DEG),
         ),
+        levels=heights((0.45, 0.70), (0.45, 0.95), (0.45, 1.15)),
         randomization=replace(FRICTION, latency=(0.0, 18.0), zero_latency_probability=0.1),
-        evaluation=replace(task.evaluation, hold=HOLD),
+        evaluation=HeightEvaluation(hold=HOLD),
     )
-    task = task.with_terms("terminations", moved_away={"distance": 0.25 * farther})
+    task = task.with_terms("terminations", moved_away={"distance": 0.25})
     return task.with_terms(
         "rewards", jump_height={"weight": 80.0, "scale_sharp": 0.025}, estimated_jump_height={"scale_sharp": 0.025},
         horizontal_velocity={"weight": 25.0}, ground_posture={"weight": 40.0, "std": 20.0 * DEG, "shift": STANCE},
     )  # fmt: skip
-
-
-def vertical_jump_standing() -> TaskCfg:
-    """Return the task of a vertical jump from a stance."""
-    task = to_heights(vertical_jump(), "vertical-jump-standing")
-    return replace(task, levels=heights((0.45, 0.70), (0.45, 0.95), (0.45, 1.15)))
-
-
-def vertical_jump_mars_standing() -> TaskCfg:
-    """Return the task of a vertical jump from a stance on Mars."""
-    task = to_heights(vertical_jump_mars_loose(), "vertical-jump-mars-stance", FARTHER)
-    task = replace(task, curriculum=task.curriculum.replace(promote_after=1))
-    return task.with_terms("terminations", turned_touchdown={"rotation": 40.0 * DEG, "yaw": 20.0 * DEG})
 
 
 def level_all_around(ahead: float, around: float) -> Level:
@@ -100,48 +86,37 @@ REACHES = ((0.5, 0.3), (0.9, 0.5), (1.3, 0.7), (1.7, 0.9), (2.2, 0.95))
 """[m] Farthest goals, ahead and in other directions, of each level above the first."""
 
 
-def to_places(task: TaskCfg, name: str, farther: float = 1.0) -> TaskCfg:
-    """Return a task of jumps from a stance to places, with paw friction coefficients of 0.35 to 1.2.
+def horizontal_jump_standing() -> TaskCfg:
+    """Return the task of a jump from a stance in any direction, with paw friction coefficients of 0.35 to 1.2.
 
     A jump to the side needs different motions of left and right legs: the reward of symmetry is half that of the jump
-    ahead. task: of jumps from a crouch; farther: factor on lengths of landing errors.
+    ahead.
     """
     starts = StartProbability(
         standing=0.30, default=0.15, in_flight=0.15, touchdown=0.10, after_landing=0.20, pushing=0.10
     )
-    task = standing(task, 0.5 * SECOND, 0.3, starts)
+    task = standing(horizontal_jump(), 0.5 * SECOND, 0.3, starts)
     settings = replace(
         task.reset.settings, forward_pitch=0.0, takeoff_pitch=(0.0, 0.0), takeoff_ahead=(0.0, 0.2),
         touchdown_behind=(0.05, 0.12), transversal_limit=130.0,
     )  # fmt: skip
-    thighs = replace(task.command_filter.transversal, upper=THIGH_LIMIT)
     task = replace(
         task,
-        name=name,
+        name="horizontal-jump-standing",
         reset=replace(task.reset, settings=settings),
         rewards=(
             *task.rewards,
-            RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10 * farther, scale_by_dt=False),
+            RewardTerm(rewards.touchdown_tracking, 200.0, std=0.10, scale_by_dt=False),
             RewardTerm(rewards.settled, 600.0, first=0.9 * SECOND, last=1.1 * SECOND, std=0.12),
         ),
         terminations=(*task.terminations, TerminationTerm(terminations.walked, margin=0.08, fraction=0.25)),
         curriculum=task.curriculum.replace(promote_after=1),
-        command_filter=replace(task.command_filter, transversal=thighs),
+        command_filter=replace(task.command_filter, transversal=replace(JUMP_TRANSVERSAL, upper=THIGH_LIMIT)),
+        levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
         randomization=replace(FRICTION, latency=(0.0, 20.0), zero_latency_probability=0.1),
-        evaluation=replace(task.evaluation, hold=HOLD),
+        evaluation=PlaceEvaluation(hold=HOLD),
     )
     return task.with_terms(
         "rewards", left_right_symmetry={"weight": 10.0}, base_at_rest={"weight": 80.0},
         standing_posture={"weight": 200.0, "std": 30.0 * DEG, "shift": STANCE},
     )  # fmt: skip
-
-
-def horizontal_jump_standing() -> TaskCfg:
-    """Return the task of a jump from a stance in any direction."""
-    task = to_places(horizontal_jump(), "horizontal-jump-standing")
-    return replace(task, levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS))
-
-
-def horizontal_jump_mars_standing() -> TaskCfg:
-    """Return the task of a jump ahead from a stance on Mars."""
-    return to_places(horizontal_jump_mars_loose(), "horizontal-jump-mars-stance", FARTHER)
