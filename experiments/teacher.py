@@ -29,7 +29,7 @@ from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.predictive_control import PredictiveController
 from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.policies.policy import Policy, actor_init_from_policy, save_policy, task_symmetry
+from jumper_warp.policies.policy import Policy, actor_init_from_policy, save_policy, task_symmetries
 from jumper_warp.policies.spec import make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import FROM_STANCE, register_task
@@ -137,9 +137,9 @@ def imitate(args: Args, obs: torch.Tensor, actions: torch.Tensor, device: torch.
     torch.manual_seed(args.seed)
     recipe = Recipe.of(NAME)
     ppo = recipe.train.ppo
-    symmetry = task_symmetry(recipe.task)
+    symmetries = task_symmetries(recipe.task, "actor")
     init = actor_init_from_policy(args.policy, recipe.task, ppo)
-    model = ActorCritic(obs.shape[1], 12, ppo.hidden, ppo.activation, symmetry=symmetry)
+    model = ActorCritic(obs.shape[1], 12, ppo.hidden, ppo.activation, symmetries=symmetries)
     apply_actor_init(init, model, 1)
     model.to(device)
     features, actions = model.features(obs.to(device)), actions.to(device)
@@ -154,7 +154,7 @@ def imitate(args: Args, obs: torch.Tensor, actions: torch.Tensor, device: torch.
             optimiser.step()
     rms = (model.mean(features).clamp(-1.0, 1.0) - actions).square().mean().sqrt().item()
     earth = Policy.load(args.policy)
-    layers = expand_layers([(w.detach().cpu(), b.detach().cpu()) for w, b in linear_layers(model.actor)], symmetry)
+    layers = expand_layers([(w.detach().cpu(), b.detach().cpu()) for w, b in linear_layers(model.actor)], symmetries)
     spec = make_interface(
         interface(recipe.task) | {"observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT},
         policy_dt=earth.interface.policy_dt, physics_dt=earth.interface.physics_dt,

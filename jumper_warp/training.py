@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from jumper_warp.envs.env import Env
-from jumper_warp.policies.policy import actor_init_from_policy
+from jumper_warp.policies.policy import actor_init_from_policy, task_symmetries
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
 from jumper_warp.rl.run_folder import TrainResult
-from jumper_warp.tasks.mirror import mirror_of
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,8 +40,7 @@ def train(
         raise InputError(f"the policy of {task.name} has no observation")
     if seeds is not None:
         cfg = dataclasses.replace(cfg, seeds=tuple(seeds))
-    if cfg.ppo.symmetry != "off":
-        mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
+    task_symmetries(task, cfg.ppo.symmetry)  # raises InputError where a mirror image is not known
     actor_init = None
     if cfg.init_policy and not checkpoints:
         actor_init = actor_init_from_policy(cfg.init_policy, task, cfg.ppo, recipe.robot and recipe.robot.description)

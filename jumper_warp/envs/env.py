@@ -33,7 +33,7 @@ from jumper_warp.sim.dynamics import advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SlicedGraph, SolverName
 from jumper_warp.tasks.cfg import OF_EPISODE, Handover, TaskCfg, checked_tasks
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import Mirror, mirror_image
 from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of, with_own_ranges
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_flags, check_seed
@@ -459,14 +459,12 @@ class Env(Stages):
         """
         return [value for skill in self.skills for value in skill.non_finite()]
 
-    def mirror(self, what: str) -> Mirror:
-        """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".
+    def mirror(self, what: str, plane: str = "left-right") -> Mirror:
+        """Return the mirror image (order, signs) of the first task's "observation", or of an "action".
 
-        Raises InputError (a ValueError): another text, or the mirror image of a term is not known.
+        Arguments and errors: as `mirror_image`.
         """
-        if what not in ("observation", "action"):
-            raise InputError(f"mirror needs 'observation' or 'action', got {what!r:.40}")
-        return mirror_of_action() if what == "action" else mirror_of(self.task, "actor")
+        return mirror_image(self.task, what, plane)
 
     def config(self) -> dict:
         """Return all settings that define the environment as JSON data.

@@ -71,10 +71,12 @@ class VecEnv(Protocol):
 
 @runtime_checkable
 class MirroredVecEnv(Protocol):
-    """Environment with mirror images, which PPO needs to train a left-right symmetric policy."""
+    """Environment with mirror images, which PPO needs to train a symmetric policy."""
 
-    def mirror(self, what: str) -> tuple[Sequence[int], Sequence[float]]:
+    def mirror(self, what: str, plane: str, /) -> tuple[Sequence[int], Sequence[float]]:
         """Return (order, signs) of the mirror image `signs * x[order]` of an "observation" or an "action" x.
+
+        plane: "left-right" or "front-back".
 
         Raises ValueError: no mirror image is defined.
         """

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
@@ -29,14 +30,14 @@ from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
+from jumper_warp.rl.mirror import Symmetries, Weights, expand_layers, make_symmetries, symmetries_in
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
 from jumper_warp.rl.run_names import CHECKPOINTS
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.tasks import saving
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import mirror_image
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
@@ -261,9 +262,8 @@ def _policy_of_checkpoint(state: Json) -> Policy:
     config = parse_json(state["config"], "config")
     model = state["ppo"]["model"]
     layers = _actor_layers(model, "actor.")
-    if any(name.startswith("mirror_") for name in model):
-        parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
-        layers = expand_layers(layers, Symmetry(*(mirror_map(*part) for part in parts)))
+    mirrors = {name: value.view(-1, value.shape[-1]) for name, value in model.items() if name.startswith("mirror_")}
+    layers = expand_layers(layers, symmetries_in(mirrors))
     mean = model["obs_moments.mean"].float()
     std = (model["obs_moments.var"] + VARIANCE_EPS).sqrt().float()
     activation = config["train"]["ppo"]["activation"]
@@ -411,13 +411,16 @@ def actor_init_from_policy(
     """
     policy = Policy.load(source)
     check_interface(policy.interface, interface(task, robot))
-    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
-    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
+    symmetries = task_symmetries(task, cfg.symmetry)
+    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetries)
 
 
-def task_symmetry(task: TaskCfg) -> Symmetry:
-    """Return the left-right mirror maps of a task's actor observation and action."""
-    return Symmetry(mirror_map(*mirror_of(task, "actor"), "observation"), mirror_map(*mirror_of_action(), "action"))
+def task_symmetries(task: TaskCfg, symmetry: str) -> Symmetries:
+    """Return the mirror maps of a task's actor observation and action; symmetry: as in `PpoCfg`.
+
+    Raises InputError: a mirror image is not known.
+    """
+    return make_symmetries(symmetry, partial(mirror_image, task))
 
 
 def check_interface(policy: PolicyInterface, task: Json) -> None:

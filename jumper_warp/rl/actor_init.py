@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, Weights, contract_layers, nearest_expanded_layers
+from jumper_warp.rl.mirror import Symmetries, Weights, contract_layers
 from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 
@@ -30,14 +30,14 @@ class ActorInit(NamedTuple):
 
 def make_actor_init(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
-    symmetry: Symmetry | None = None,
+    symmetries: Symmetries = (),
 ) -> ActorInit:  # fmt: skip
     """Return initial weights and observation statistics, from a trained policy, of an actor with settings `cfg`.
 
-    Without `symmetry` the actor equals the policy. With it, a policy g that is nearly mirror-symmetric is projected to
-    the nearest symmetric policy; any other becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
-    layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: the
-    task's mirror maps if cfg.symmetry is "actor", else None.
+    Without `symmetries` the actor equals the policy. With them, a policy that is nearly symmetric is projected to the
+    nearest symmetric one; any other becomes the mean over all images, as in `jumper_warp.rl.mirror`.
+    layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetries: the
+    task's mirror maps for cfg.symmetry.
     Raises InputError: hidden layers or activation differ from the settings, or std is below sqrt(VARIANCE_EPS).
     """
     if activation != cfg.activation:
@@ -46,10 +46,11 @@ def make_actor_init(
             f"pass --ppo.activation {activation}"
         )
     policy_widths = [len(bias) for _, bias in layers[:-1]]
-    contracted = None if symmetry is None else _contracted_layers(layers, mean, std, symmetry)
+    policy = (layers, mean, std, symmetries)
+    contracted = _contracted_layers(*policy, SYMMETRY_TOLERANCE) if symmetries else None
     required = [len(bias) for _, bias in (contracted or layers)[:-1]]
     if required != list(cfg.hidden):
-        settings_widths = [width if contracted is None else 2 * width for width in cfg.hidden]
+        settings_widths = [width if contracted is None else 2 ** len(symmetries) * width for width in cfg.hidden]
         raise InputError(
             f"init_policy: the policy has hidden layers {_joined(policy_widths)}, the settings "
             f"{_joined(settings_widths)}: pass --ppo.hidden {_joined(required, ' ')}"
@@ -57,11 +58,11 @@ def make_actor_init(
     least = VARIANCE_EPS**0.5
     if not (std.double().square() > 0.999 * VARIANCE_EPS).all():
         raise InputError(f"init_policy: an observation's std must be at least {least:.3g}, got {std.min():.3g}")
-    if contracted is not None and symmetry is not None:
-        return ActorInit(contracted, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
-    if symmetry is None:
+    if contracted is not None:
+        return ActorInit(contracted, mean, std, "" if _contracted_layers(*policy) else "made mirror-symmetric")
+    if not symmetries:
         return ActorInit(layers, mean, std)
-    return _averaged(layers, mean, std, symmetry)
+    return _averaged(layers, mean, std, symmetries)
 
 
 @torch.no_grad()
@@ -86,37 +87,32 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
     moments.count.fill_(PRIOR_ITERATIONS * samples)
 
 
-def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the layers, of half the widths, of the left-right symmetric actor that is nearest to a policy's network.
+def _contracted_layers(
+    layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetries: Symmetries, tolerance: float = 1.0e-6
+) -> Weights | None:
+    """Return the layers, of smaller widths, of the symmetric actor that is nearest to a policy's network.
 
     Returns None if the layers are not nearly mirror-symmetric, or the observation statistics are not symmetric.
+    tolerance: as in `contract_layers`.
     """
     widths = [len(bias) for _, bias in layers[:-1]]
-    mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
-    symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
-    if not symmetric or not widths or any(width % 2 for width in widths):
+    symmetric = all(
+        torch.allclose(each.obs.apply(mean), mean, atol=1e-5) and torch.allclose(std[each.obs.order], std)
+        for each in symmetries
+    )
+    if not symmetric or not widths or any(width % 2 ** len(symmetries) for width in widths):
         return None
-    nearest = nearest_expanded_layers(layers, symmetry)
-    pairs = zip(layers, nearest, strict=True)
-    near = all((weight - w).norm() <= SYMMETRY_TOLERANCE * weight.norm() for (weight, _), (w, _) in pairs)
-    return contract_layers(nearest, symmetry) if near else None
+    return contract_layers(layers, symmetries, tolerance)
 
 
-def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether a network's layers are those of a left-right symmetric actor, written as a plain network."""
-    try:
-        contract_layers(layers, symmetry)
-    except InputError:
-        return False
-    return True
-
-
-def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
+def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetries: Symmetries) -> ActorInit:
     """Make a policy mirror-symmetric: average its actions with the mirror images for mirrored observations.
 
     Its network becomes that of the symmetric actor, its layers rescaled to mirror-symmetric observation statistics.
     """
-    new_mean, new_var = symmetry.obs.symmetrise_moments(mean.double(), std.double().square())
+    new_mean, new_var = mean.double(), std.double().square()
+    for each in symmetries:
+        new_mean, new_var = each.obs.symmetrise_moments(new_mean, new_var)
     rescaled = rescale_inputs(layers, mean, std, new_mean, new_var.sqrt())
     new_layers = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in rescaled]
     change = "its actions averaged with their mirror images"

@@ -73,9 +73,9 @@ class PpoCfg:
     """Widths of the hidden layers of actor and critic."""
     activation: str = "elu"
     """Activation of the hidden layers: elu, relu or tanh."""
-    symmetry: Literal["off", "actor"] = "off"
-    """Left-right symmetry of the policy. With `actor`, mirrored observations give mirrored actions for any weights; the
-    task must define the mirror image of its observation."""
+    symmetry: Literal["off", "actor", "both"] = "off"
+    """Symmetry of the policy. With `actor`, observations that are mirrored left to right give mirrored actions for any
+    weights, with `both` also those mirrored front to back; the task must define these mirror images."""
     tf32: bool = True
     """Whether matrix products on a GPU may use TF32, which rounds their factors to 10 mantissa bits."""
     graphs: bool = True

@@ -18,7 +18,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import all_reduce_mean
 from jumper_warp.rl.flat import FlatAdam, FlatParameters
 from jumper_warp.rl.graphs import CapturedProcedure
-from jumper_warp.rl.mirror import symmetry_of
+from jumper_warp.rl.mirror import symmetries_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.samples import Batch
 from jumper_warp.utils.allocator import keep_freed_memory
@@ -31,7 +31,6 @@ class StepStatistics(NamedTuple):
     surrogate: torch.Tensor
     value: torch.Tensor  # value loss before weighting [variances of the return]
     entropy: torch.Tensor
-    asymmetry: torch.Tensor
     kl: torch.Tensor  # KL(old ‖ new) [nat], over all ranks
     gradient_actor: torch.Tensor  # norm of the actor's gradient before clipping, averaged over all ranks
     gradient_critic: torch.Tensor  # norm of the critic's gradient, likewise
@@ -62,7 +61,7 @@ class Learner(ABC):
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build actor, critic and optimiser on the environment's device; weights follow torch's CPU seed.
 
-        Raises InputError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
+        Raises InputError as `PpoCfg.batch_size`, and as `symmetries_of` if symmetry is requested.
         """
         self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
@@ -71,9 +70,9 @@ class Learner(ABC):
         else:
             keep_freed_memory()
         num_critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
-        self.symmetry = None if cfg.symmetry == "off" else symmetry_of(env)
+        self.symmetries = symmetries_of(env, cfg.symmetry)
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, self.symmetry,
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, self.symmetries,
         ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model)
         self.optimiser = FlatAdam(self.flat, cfg.lr)

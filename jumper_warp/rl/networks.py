@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from jumper_warp.rl.distributed import all_reduce_mean, world_size
-from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
+from jumper_warp.rl.mirror import MirrorMap, Symmetries, Symmetry, Weights, symmetries_in
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0  # Normalised observations are clipped to ± this many standard deviations
@@ -156,13 +156,13 @@ class ActorCritic(nn.Module):
 
     def __init__(
         self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0,
-        num_critic_obs: int | None = None, symmetry: Symmetry | None = None,
+        num_critic_obs: int | None = None, symmetries: Symmetries = (),
     ) -> None:  # fmt: skip
         """Create actor and critic with random weights and without observation statistics.
 
         num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic. hidden: widths of
         the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial standard deviation of
-        the noise on every action. symmetry: makes the policy mirror-symmetric (default: not).
+        the noise on every action. symmetries: of the policy.
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
@@ -172,37 +172,26 @@ class ActorCritic(nn.Module):
         self.obs_moments = RunningMoments((num_obs,))
         self.critic_moments = RunningMoments((num_critic_obs,))
         self.value_moments = RunningMoments()
-        self._symmetric = symmetry is not None
-        for name, mirror in symmetry._asdict().items() if symmetry is not None else ():
-            self.register_buffer(f"mirror_{name}_order", mirror.order)
-            self.register_buffer(f"mirror_{name}_signs", mirror.signs)
+        for name in Symmetry._fields if symmetries else ():
+            for part in MirrorMap._fields:
+                maps = [getattr(getattr(each, name), part) for each in symmetries]
+                self.register_buffer(f"mirror_{name}_{part}", torch.stack(maps))
 
     @property
-    def symmetry(self) -> Symmetry | None:
-        """Left-right mirror maps of the policy, on the device of the weights; None if it is not symmetric."""
-        if not self._symmetric:
-            return None
-        parts = [
-            MirrorMap(*(getattr(self, f"mirror_{name}_{part}") for part in MirrorMap._fields))
-            for name in Symmetry._fields
-        ]
-        return Symmetry(*parts)
+    def symmetries(self) -> Symmetries:
+        """Mirror maps of the policy, on the device of the weights."""
+        return symmetries_in(dict(self.named_buffers()))
 
     def mean(self, features: torch.Tensor) -> torch.Tensor:
         """Return the policy's mean action, (..., num_actions), for normalised observations (..., num_obs)."""
-        return self.mean_and_asymmetry(features)[0]
-
-    def mean_and_asymmetry(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the mean action, and f(x) - N f(M x) (symbols: `jumper_warp.rl.mirror`), 0 without symmetry.
-
-        Both are (..., num_actions); features: (..., num_obs).
-        """
-        if (symmetry := self.symmetry) is None:
-            mean = self.actor(features)
-            return mean, torch.zeros_like(mean)
-        output, mirrored = self.actor(torch.stack([features, symmetry.obs.apply(features)]))
-        image = symmetry.action.apply(mirrored)
-        return 0.5 * (output + image), output - image
+        symmetries, x = self.symmetries, features[None]
+        for each in symmetries:
+            x = torch.cat([x, each.obs.apply(x)])
+        mean = self.actor(x)
+        for each in reversed(symmetries):
+            direct, image = mean.chunk(2)
+            mean = 0.5 * (direct + each.action.apply(image))
+        return mean[0]
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
         """Return the actor's input for raw observations (..., num_obs): normalised, within ±NORMALISED_LIMIT."""

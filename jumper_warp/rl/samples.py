@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import MirrorMap
+from jumper_warp.rl.mirror import Symmetries
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
 
 
@@ -78,17 +78,16 @@ def gae(
     return advantage, advantage + value[:-1]
 
 
-def update_statistics(model: ActorCritic, local: RolloutMoments, obs_mirror: MirrorMap | None, cfg: PpoCfg) -> Scaling:
+def update_statistics(model: ActorCritic, local: RolloutMoments, symmetries: Symmetries, cfg: PpoCfg) -> Scaling:
     """Update a model's running moments by those of a rollout over all ranks; return the normalisation of advantages.
 
     Advantages are normalised over the batch of all ranks, with the unbiased variance. local: moments of this rank's
-    samples. obs_mirror: map that symmetrises those of the actor's observations: a mirror-symmetric actor needs a mean
-    and a variance that mirror images share.
+    samples. symmetries: of the actor, which needs a mean and a variance of observations that mirror images share.
     """
     moments = RolloutMoments(*all_reduce_moments(local))
     obs_moments = moments.obs
-    if obs_mirror is not None:
-        symmetric = obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
+    for each in symmetries:
+        symmetric = each.obs.symmetrise_moments(obs_moments.mean, obs_moments.var)
         obs_moments = Moments(*symmetric, obs_moments.count)
     model.obs_moments.update_from_moments(obs_moments)
     model.critic_moments.update_from_moments(moments.critic_obs)

@@ -1,7 +1,7 @@
-"""Left-right mirror maps of a task's observations and actions, as permutations and signs.
+"""Mirror maps of a task's observations and actions, as permutations and signs.
 
-A mirror-symmetric policy needs them: the robot is symmetric about its x-z plane. A term's mirror image is given by
-columns counted from 1, negative where the sign changes.
+A symmetric policy needs them: the robot is symmetric about its x-z plane and, except for the width of its stance, about
+its y-z plane. A term's mirror image is given by columns counted from 1, negative where the sign changes.
 """
 
 from __future__ import annotations
@@ -11,37 +11,46 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jumper_warp.kernels.mdp.mirror import MOTORS
+from jumper_warp.kernels.mdp.mirror import FRONT_BACK_MOTORS, MOTORS
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 
 class Mirror(NamedTuple):
-    """Left-right mirror map: a permutation and signs; the mirror image of a vector x is `signs * x[order]`."""
+    """Mirror map: a permutation and signs; the mirror image of a vector x is `signs * x[order]`."""
 
     order: np.ndarray  # (columns,) int, source column of each column
     signs: np.ndarray  # (columns,) float32, 1 or -1
 
 
-def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the left-right mirror map of a task's observation; group: "actor" or "critic".
+def mirror_image(task: TaskCfg, what: str, plane: str = "left-right") -> Mirror:
+    """Return the mirror map of a task's "observation" or of an "action"; plane: "left-right" or "front-back".
+
+    Raises InputError: another text, or the mirror image of a term is not known.
+    """
+    if what not in ("observation", "action"):
+        raise InputError(f"mirror needs 'observation' or 'action', got {what!r:.40}")
+    if what == "observation":
+        return mirror_of(task, "actor", plane)
+    return _mirror(MOTORS if plane == "left-right" else FRONT_BACK_MOTORS)
+
+
+def mirror_of(task: TaskCfg, group: str, plane: str = "left-right") -> Mirror:
+    """Return the mirror map of a task's observation; group: "actor" or "critic"; plane: as in `mirror_image`.
 
     Each frame of a term's history is mirrored on its own: columns of the term become columns of the observation.
     Raises InputError: the mirror image of a term is not known.
     """
     columns: list[int] = []
     for term in getattr(task.observations, group):
-        if term.mirror is None:
-            raise InputError(f"{task.name} {group}: the mirror image of {term.name} is not known; pass it as mirror=")
+        image = term.mirror if plane == "left-right" else getattr(term.func, "front_back", None)
+        if image is None:
+            hint = "; pass it as mirror=" if plane == "left-right" else ""
+            raise InputError(f"{task.name} {group}: the {plane} mirror image of {term.name} is not known{hint}")
         for _ in range(term.options["history"]):
             first = len(columns)
-            columns += [column + (first if column > 0 else -first) for column in term.mirror]
+            columns += [column + (first if column > 0 else -first) for column in image]
     return _mirror(columns)
-
-
-def mirror_of_action() -> Mirror:
-    """Return the left-right mirror map of an action (12,), in motor order."""
-    return _mirror(MOTORS)
 
 
 def _mirror(columns: Sequence[int]) -> Mirror:

@@ -145,8 +145,8 @@ def block_ahead(arrays: RobotArrays, ground: Ground, world: int) -> vec7:
     return distances
 
 
-set_mirror((1,), wanted_height, jump_command)
+set_mirror((1,), wanted_height, jump_command, front_back=(1,))
 set_mirror((1, 2), phase_times, height_errors)
-set_mirror((1, -2), goal, landing_miss, way)
+set_mirror((1, -2), goal, landing_miss, way, front_back=(-1, 2))
 set_mirror((1, 2, 3), phase)
 set_mirror((5, 6, 3, 4, 1, 2, 7), block_ahead)  # begin and end of left, middle and right ray; height

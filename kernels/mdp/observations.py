@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from .mirror import LEGS, MOTORS, ROTATION, VECTOR, set_mirror
+from .mirror import FRONT_BACK_MOTORS, LEGS, MOTORS, ROTATION, VECTOR, set_mirror
 from .parameters import RobotParameters, nominal_column
 from .view import RobotView, vec12
 
@@ -145,9 +145,10 @@ def drawn_push(robot: RobotParameters, world: int) -> vec6:
     return vec6(wrench[0] / 5.0, wrench[1] / 5.0, wrench[2] / 5.0, wrench[3] / 3.0, wrench[4] / 3.0, wrench[5] / 3.0)
 
 
-set_mirror((1,), height, drawn_latency)
+set_mirror((1,), height, drawn_latency, front_back=(1,))
 set_mirror((1, 2), drawn_mass, drawn_friction)
-set_mirror(VECTOR, lin_vel, gravity, drawn_com)
-set_mirror(ROTATION, ang_vel)
+set_mirror(VECTOR, lin_vel, gravity, drawn_com, front_back=(-1, 2, 3))
+set_mirror(ROTATION, ang_vel, front_back=(1, -2, -3))
 set_mirror(LEGS, paw_forces, air_times, contacts)
-set_mirror(MOTORS, angle, rate, last_action, drawn_gains, drawn_speed_limits, drawn_offset)
+set_mirror(MOTORS, angle, rate, last_action, front_back=FRONT_BACK_MOTORS)
+set_mirror(MOTORS, drawn_gains, drawn_speed_limits, drawn_offset)

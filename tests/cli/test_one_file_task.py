@@ -18,7 +18,7 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.policies.policy import load_policy
 from jumper_warp.registry import load_task_module, make_task
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import mirror_image, mirror_of
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import read_values
 from jumper_warp.viz.picture import compose
@@ -43,7 +43,7 @@ def policy(tmp_path_factory):
 
 def test_trained_policy_is_mirror_symmetric(policy):
     network, obs = load_policy(policy), torch.randn((5, 41), generator=torch.Generator().manual_seed(1))
-    (order, signs), (motors, _) = mirror_of(make_task("go-to"), "actor"), mirror_of_action()
+    (order, signs), (motors, _) = mirror_of(make_task("go-to"), "actor"), mirror_image(make_task("go-to"), "action")
     mirrored = network.act(torch.from_numpy(signs) * obs[:, order])
     action = network.act(obs)
     torch.testing.assert_close(mirrored, action[:, motors], atol=1e-5, rtol=1e-5)

@@ -70,7 +70,7 @@ class PushTask:
         self.age *= 1.0 - self.done
         self.show_critic(self.critic_obs, self.obs)
 
-    def mirror(self, what: str) -> tuple[list[int], list[float]]:
+    def mirror(self, what: str, plane: str) -> tuple[list[int], list[float]]:
         """Return the mirror map (order, signs): the image of position, velocity and acceleration is the negative."""
         return ([0, 1], [-1.0, -1.0]) if what == "observation" else ([0], [-1.0])
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.policies.policy import Policy, actor_init_from_policy, task_symmetry
+from jumper_warp.policies.policy import Policy, actor_init_from_policy, task_symmetries
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init, make_actor_init
@@ -28,11 +28,11 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a sym
 )
 def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     policy, cfg, task = Policy.load(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
-    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
-    assert (symmetry is not None) == (name == "horizontal_jump" and not change)
+    symmetries = task_symmetries(task, cfg.symmetry)
+    assert len(symmetries) == (name == "horizontal_jump" and not change)
     torch.manual_seed(0)
     sizes = policy.interface.sizes
-    model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
+    model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetries=symmetries)
     apply_actor_init(actor_init_from_policy(name, task, cfg), model, samples=1000)
     obs = policy.mean + 2.0 * policy.std * torch.randn(500, sizes[0])
     expected = policy.act(obs)
@@ -66,11 +66,11 @@ def test_the_policy_is_compared_with_the_robot_of_the_training(tmp_path):
 
 def test_symmetric_training_starts_from_the_projection_of_a_nearly_symmetric_policy():
     policy, task, cfg = Policy.load("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
-    symmetry, generator = task_symmetry(task), torch.Generator().manual_seed(2)
+    symmetries, generator = task_symmetries(task, cfg.symmetry), torch.Generator().manual_seed(2)
     layers = [(w + 3.0e-4 * torch.randn(w.shape, generator=generator), bias) for w, bias in policy.layers]
     near = Policy(layers, policy.mean, policy.std, policy.interface, policy.config)
-    start = make_actor_init(layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
-    model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
+    start = make_actor_init(layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetries)
+    model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetries=symmetries)
     apply_actor_init(start, model, samples=1000)
     obs = policy.mean + policy.std * torch.randn(500, 147, generator=generator)
     assert start.change == "made mirror-symmetric"

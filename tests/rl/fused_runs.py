@@ -45,7 +45,9 @@ class NoiseTask(PushTask):
         self.done.copy_((torch.rand_like(self.done) < 0.3).float())
         self.timeout.copy_(self.done * (torch.rand_like(self.done) < 0.5).float())
 
-    def mirror(self, what):
+    def mirror(self, what, plane):
+        if plane == "front-back":
+            return ([0, 1, 2, 3, 4], [-1.0, -1.0, 1.0, 1.0, 1.0]) if what == "observation" else ([2, 1, 0], [1.0] * 3)
         if what == "observation":
             return [1, 0, 2, 4, 3], [1.0, 1.0, -1.0, -1.0, -1.0]
         return [2, 1, 0], [1.0, -1.0, 1.0]

@@ -3,15 +3,20 @@
 import torch
 
 
+def averaged(act, mirror):
+    """Return the policy (act(x) + N act(M x)) / 2, in the notation of `jumper_warp.rl.mirror`."""
+    return lambda x: 0.5 * (act(x) + mirror.action.apply(act(mirror.obs.apply(x))))
+
+
 def reference_losses(model, part, old_log_std, cfg):
-    """Return surrogate, value loss, entropy, asymmetry and KL divergence, each (), by torch.distributions.
+    """Return surrogate, value loss, entropy and KL divergence, each (), by torch.distributions.
 
     part: a minibatch, (samples, ...) by the fields of `Batch`. old_log_std: (num_actions,) of the policy that acted.
     """
-    output, mirror = model.actor(part["features"]), model.symmetry
-    image = mirror.action.apply(model.actor(mirror.obs.apply(part["features"]))) if mirror else output
-    mean = 0.5 * (output + image) if cfg.symmetry == "actor" else output
-    asymmetry = torch.nn.functional.mse_loss(output, image)
+    means = model.actor
+    for mirror in model.symmetries:
+        means = averaged(means, mirror)
+    mean = means(part["features"])
     policy = torch.distributions.Normal(mean, model.log_std.exp())
     old = torch.distributions.Normal(part["mean"], old_log_std.exp())
     ratio = (policy.log_prob(part["action"]) - old.log_prob(part["action"])).sum(-1).exp()
@@ -24,4 +29,4 @@ def reference_losses(model, part, old_log_std, cfg):
         loss = torch.max(loss, (clipped_value - part["target"]) ** 2)
     entropy = policy.entropy()[0].sum()
     kl = torch.distributions.kl_divergence(old, policy).sum(-1).mean()
-    return surrogate, loss.mean(), entropy, asymmetry, kl.detach()
+    return surrogate, loss.mean(), entropy, kl.detach()

@@ -5,21 +5,22 @@ import numpy as np
 import pytest
 import torch
 
-from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.policy import Policy, task_symmetries
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
-from jumper_warp.rl.mirror import Symmetry, expand_layers, mirror_map
+from jumper_warp.rl.mirror import expand_layers, mirror_map
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.torch.ppo import Ppo
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import mirror_image
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 from toy_task import PushTask
 
-OBS, ACTION = mirror_of(make_task("velocity-flat"), "actor"), mirror_of_action()
-WALKING = Symmetry(mirror_map(*OBS, "observation"), mirror_map(*ACTION, "action"))
+OBS, ACTION = (mirror_image(make_task("velocity-flat"), name) for name in ("observation", "action"))
+WALKING = task_symmetries(make_task("velocity-flat"), "actor")
+JUMPING = task_symmetries(make_task("horizontal-jump"), "both")
 NUM_OBS = len(OBS.order)
 CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="actor")
 
@@ -29,10 +30,10 @@ def mirrored(x, mirror):
     return torch.from_numpy(mirror.signs) * x[..., torch.from_numpy(mirror.order)]
 
 
-def walker(hidden=(32, 24)):
-    """Return a symmetric `ActorCritic` of the walking task with actions as large as its inputs."""
+def walker(hidden=(32, 24), symmetries=WALKING):
+    """Return a symmetric `ActorCritic`, by default of the walking task, with actions as large as its inputs."""
     torch.manual_seed(3)
-    model = ActorCritic(NUM_OBS, 12, hidden, symmetry=WALKING)
+    model = ActorCritic(len(symmetries[0].obs.order), 12, hidden, symmetries=symmetries)
     with torch.no_grad():
         model.actor[-1].weight.mul_(100.0)
         model.actor[-1].bias.normal_()
@@ -45,22 +46,31 @@ def test_mirrored_observation_gives_the_mirrored_action():
     assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1  # f alone is not
 
 
+def test_both_mirrored_observations_give_the_mirrored_actions():
+    model, x = walker(symmetries=JUMPING), torch.randn(64, len(JUMPING[0].obs.order))
+    left_right, front_back = JUMPING
+    for obs, action in (left_right, front_back):
+        torch.testing.assert_close(model.mean(obs.apply(x)), action.apply(model.mean(x)), atol=1e-5, rtol=1e-5)
+    assert (model.mean(left_right.obs.apply(x)) - front_back.action.apply(model.mean(x))).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("symmetries", [WALKING, JUMPING], ids=["left-right", "both"])
 @pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
-def test_expanded_plain_network_has_the_same_output(hidden):
-    model, x = walker(hidden), torch.randn(16, NUM_OBS)
+def test_expanded_plain_network_has_the_same_output(hidden, symmetries):
+    model, x = walker(hidden, symmetries), torch.randn(16, len(symmetries[0].obs.order))
     linear = [layer for layer in model.actor if isinstance(layer, torch.nn.Linear)]
     expected = model.mean(x)
-    layers = expand_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
+    layers = expand_layers([(layer.weight, layer.bias) for layer in linear], symmetries)
     for index, (weight, bias) in enumerate(layers):
         x = torch.nn.functional.linear(x, weight, bias)
         x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
-    assert [weight.shape[0] for weight, _ in layers] == [*(2 * width for width in hidden), 12]
+    assert [weight.shape[0] for weight, _ in layers] == [*(2 ** len(symmetries) * width for width in hidden), 12]
     torch.testing.assert_close(x, expected, atol=1e-5, rtol=1e-5)
 
 
 def test_symmetrised_moments_are_those_of_samples_and_images():
     x = torch.randn(5000, NUM_OBS) * 0.7 + torch.linspace(-1.0, 1.0, NUM_OBS)
-    mean, var = WALKING.obs.symmetrise_moments(x.mean(0), x.var(0, correction=0))
+    mean, var = WALKING[0].obs.symmetrise_moments(x.mean(0), x.var(0, correction=0))
     both = torch.cat([x, mirrored(x, OBS)])
     torch.testing.assert_close(mean, both.mean(0), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(var, both.var(0, correction=0), atol=1e-5, rtol=1e-5)

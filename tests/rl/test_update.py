@@ -26,7 +26,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
     for order in orders:
         for samples in order.chunk(cfg.minibatches):
             part = {name: value[samples] for name, value in batch.items()}
-            surrogate, value, entropy, asymmetry, kl = reference_losses(model, part, old_log_std, cfg)
+            surrogate, value, entropy, kl = reference_losses(model, part, old_log_std, cfg)
             optimiser.zero_grad()
             loss = surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy
             loss.backward()
@@ -37,7 +37,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
             elif 1e-6 * cfg.desired_kl < kl < cfg.desired_kl / 2:
                 group["lr"] = min(group["lr"] * 1.5, cfg.max_lr)
             optimiser.step()
-            history.append([float(x.detach()) for x in (surrogate, value, entropy, asymmetry, kl, *norms)])
+            history.append([float(x.detach()) for x in (surrogate, value, entropy, kl, *norms)])
     return optimiser, history
 
 
@@ -48,7 +48,7 @@ def updated_ppo(cfg, device="cpu"):
     fill(ppo, slice(None), WORLDS)
     torch.manual_seed(1)
     ppo.batch()  # running statistics other than the identity
-    before = ActorCritic(2, 1, cfg.hidden, cfg.activation, num_critic_obs=3, symmetry=ppo.model.symmetry)
+    before = ActorCritic(2, 1, cfg.hidden, cfg.activation, num_critic_obs=3, symmetries=ppo.model.symmetries)
     before.load_state_dict(ppo.state_dict()["model"])
     torch.manual_seed(1)
     ppo.update()
@@ -85,11 +85,11 @@ def test_update_agrees_with_autograd_and_adam(change):
         torch.testing.assert_close(ours[name], param, atol=2e-5, rtol=1e-4, msg=name)
     metrics = ppo.statistics()
     means = torch.tensor(history).mean(0).tolist()
-    names = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic")
+    names = ("surrogate", "value", "entropy", "kl", "gradient_actor", "gradient_critic")
     for name, mean in zip(names, means, strict=True):
         assert metrics[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
     assert metrics["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
-    assert max(row[5] for row in history) > cfg.max_grad_norm  # some gradients of the actor were clipped
+    assert max(row[4] for row in history) > cfg.max_grad_norm  # some gradients of the actor were clipped
     their_state = optimiser.state_dict()["state"]
     for index, state in ppo.optimiser.state_dict().items():
         for name in ("step", "exp_avg", "exp_avg_sq"):

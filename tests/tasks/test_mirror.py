@@ -14,7 +14,7 @@ from jumper_warp.kernels.velocity import observations as velocity
 from jumper_warp.registry import make_task
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
 from jumper_warp.tasks.cfg import ObservationsCfg
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
+from jumper_warp.tasks.mirror import mirror_image, mirror_of
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.utils.errors import InputError
 from velocity_helpers import edit, states_of, walking_env
@@ -121,7 +121,7 @@ def test_observation_of_a_mirrored_robot_is_the_mirror_image(reflection, group):
 
 def test_mirroring_twice_is_the_identity():
     """A mirror image is x -> signs * x[order], of observations and of actions."""
-    for mirror in (mirror_of(task(), "actor"), mirror_of(task(), "critic"), mirror_of_action()):
+    for mirror in (mirror_of(task(), "actor"), mirror_of(task(), "critic"), mirror_image(task(), "action")):
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)

@@ -118,7 +118,7 @@ class FusedCollector:
         output = fused.actor.forward(rollout.features[step], worlds)
         launch(kernels.sample_action, (blocks(worlds, ROWS),))(
             output, fused.mirror, self._log_std, rollout.action[step], rollout.samples[step], worlds,
-            self.env.num_actions, rollout.samples.shape[2], fused.mirrored, fused.actor.width, ROWS,
+            self.env.num_actions, rollout.samples.shape[2], fused.images, fused.actor.width, ROWS,
         )  # fmt: skip
 
     def record(self, step: int) -> None:

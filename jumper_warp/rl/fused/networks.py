@@ -1,8 +1,8 @@
 """Actor and critic for the fused kernels: padded copies of the weights, activations, gradients and their partial sums.
 
-The mirror-symmetric actor evaluates f(x) and f(M x) (`jumper_warp.rl.mirror`). As W (M x) = (W M) x, its first layer
-has the weights W and W M below each other: its output (rows, 2 width) is, in memory, the input (2 rows, width) of the
-next layer. The table of `FusedLayout` ties the weights: the gradient of W is the sum of both blocks' gradients.
+A symmetric actor evaluates its network for k images M x of an observation (`jumper_warp.rl.mirror`). As W (M x) = (W M)
+x, its first layer has the weights W M below each other: its output (rows, k width) is, in memory, the input (k rows,
+width) of the next layer. The table of `FusedLayout` ties the weights: W's gradient is the sum of all blocks' gradients.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 
 from jumper_warp.rl.flat import ALIGNMENT, FlatParameters, Segment, aligned
 from jumper_warp.rl.fused.kernels import layers as kernels
-from jumper_warp.rl.mirror import MirrorMap, Symmetry
+from jumper_warp.rl.mirror import MirrorMap, images
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.utils.threads import available_threads
 
@@ -49,16 +49,16 @@ class FusedLayout:
 
     Partial sums of the gradients have the same offsets.
 
-    `table` (3, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in the
-    padded vector, the place of its mirror image, and the image's sign; 0 is a place that nothing uses.
+    `table` (2 k - 1, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in
+    the padded vector, and for each further image of the first layer place and sign; 0 is a place that nothing uses.
     """
 
-    def __init__(self, flat: FlatParameters, symmetry: Symmetry | None) -> None:
-        """Assign places to actor, noise, critic and losses; symmetry: the actor's, if it is mirror-symmetric."""
+    def __init__(self, flat: FlatParameters, obs: MirrorMap) -> None:
+        """Assign places to actor, noise, critic and losses; obs: images of the observation for the actor, (k, n)."""
         self.size = WIDTH
-        self._flat, self._table = flat, torch.zeros(3, flat.all_reduced.numel(), dtype=torch.int64)
+        self._flat = flat
+        self._table = torch.zeros(2 * len(obs.order) - 1, flat.all_reduced.numel(), dtype=torch.int64)
         count = len(flat.segments) // 2  # parameters of the actor, as many as of the critic; the noise is between
-        obs = symmetry and MirrorMap(*(part.cpu() for part in symmetry.obs))
         self.actor = self._network(flat.segments[:count], obs)
         noise = flat.segments[count]
         self.noise = self._place(noise.start + torch.arange(noise.shape[0]))
@@ -74,12 +74,12 @@ class FusedLayout:
         return start
 
     def _network(self, segments: list[Segment], obs: MirrorMap | None) -> list[Layer]:
-        """Assign places to a network's layers; obs: the observation's mirror map, which doubles the first layer."""
+        """Assign places to a network's layers; obs: images of the observation, for each of which is a first layer."""
         layers = []
         for weight, bias in zip(segments[::2], segments[1::2], strict=True):
             (num_out, num_in), first = weight.shape, not layers
-            mirror = obs if first else None
-            outputs = num_out if mirror is None else 2 * num_out
+            maps = [*zip(*obs, strict=True)][1:] if first and obs else []
+            outputs = (1 + len(maps)) * num_out
             layer = Layer(
                 self.size, self.size + aligned(outputs, WIDTH) * aligned(num_in, INPUT_WIDTH if first else WIDTH),
                 aligned(num_in, INPUT_WIDTH if first else WIDTH), aligned(outputs, WIDTH), bias,
@@ -89,18 +89,20 @@ class FusedLayout:
             index = weight.start + out * num_in + col
             self._table[0, index] = layer.weight + out * layer.inputs + col
             self._table[0, bias.start + out[:, 0]] = layer.bias + out[:, 0]
-            if mirror is not None:
-                self._table[1, index] = layer.weight + (num_out + out) * layer.inputs + mirror.order[col]
-                self._table[2, index] = mirror.signs[col].to(torch.int64).expand(num_out, -1)
-                self._table[1, bias.start + out[:, 0]] = layer.bias + num_out + out[:, 0]
-                self._table[2, bias.start + out[:, 0]] = 1
+            for image, (order, signs) in enumerate(maps, 1):
+                rows = image * num_out + out
+                self._table[2 * image - 1, index] = layer.weight + rows * layer.inputs + order[col]
+                self._table[2 * image, index] = signs[col].to(torch.int64).expand(num_out, -1)
+                self._table[2 * image - 1, bias.start + out[:, 0]] = layer.bias + rows[:, 0]
+                self._table[2 * image, bias.start + out[:, 0]] = 1
             layers.append(layer)
         return layers
 
     def copy_weights(self, weights: torch.Tensor) -> None:
         """Copy the parameters from the flat vector to the kernels' padded vector (size,)."""
-        value, (place, image, sign) = self._flat.value, self.table[:, : self._flat.size].to(torch.int64)
-        weights[image] = (sign * value).to(weights.dtype)
+        value, (place, *others) = self._flat.value, self.table[:, : self._flat.size].to(torch.int64)
+        for image, sign in zip(others[::2], others[1::2], strict=True):
+            weights[image] = (sign * value).to(weights.dtype)
         weights[place] = value.to(weights.dtype)
 
 
@@ -109,21 +111,27 @@ class FusedModel:
 
     def __init__(self, model: ActorCritic, flat: FlatParameters, rows: int, dtype: torch.dtype) -> None:
         """Allocate networks for at most `rows` samples; dtype: of weights, activations and their gradients."""
-        symmetry, device = model.symmetry, flat.value.device
-        self.mirrored = symmetry is not None
-        self.layout = layout = FusedLayout(flat, symmetry)
+        symmetries, device = model.symmetries, flat.value.device
+        obs, action = (
+            images((getattr(each, name) for each in symmetries), size)
+            for name, size in (("obs", len(model.obs_moments.mean)), ("action", len(model.log_std)))
+        )
+        self.images = len(obs.order)
+        """Number of images of an observation for which the actor's network is evaluated."""
+        self.layout = layout = FusedLayout(flat, obs)
         self.weights = torch.zeros(layout.size, dtype=dtype, device=device)
         self.splits = min(MOST_SPLITS, power_of_two(max(1, rows // SPLIT_ROWS)))
         """Number of splits of a minibatch."""
         self.partial = torch.zeros(self.splits, layout.size, device=device)
         """Sums over the splits of the samples, (splits, size of the layout)."""
         networks = (self.weights, self.partial, rows)
-        self.actor = FusedNetwork(layout.actor, flat, *networks, mirrored=self.mirrored)
+        self.actor = FusedNetwork(layout.actor, flat, *networks, self.images)
         self.critic = FusedNetwork(layout.critic, flat, *networks)
-        self.mirror = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)]).to(device)
-        """Order and signs of the action's mirror map, padded, (2, width of the actor's output)."""
-        if symmetry is not None:
-            self.mirror[:, : len(symmetry.action.order)] = torch.stack([*symmetry.action])
+        self.mirror = torch.zeros(self.images, 2, self.actor.width)
+        """Order and signs of the action's images, padded, (images, 2, width of the actor's output)."""
+        self.mirror[:] = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)])
+        self.mirror[:, :, : len(model.log_std)] = torch.stack([*action], dim=1)
+        self.mirror = self.mirror.to(device)
 
     def copy_weights(self) -> None:
         """Copy the current parameters of actor and critic to the padded vector that the kernels read."""
@@ -135,11 +143,12 @@ class FusedNetwork:
 
     def __init__(
         self, layers: list[Layer], flat: FlatParameters, weights: torch.Tensor, partial: torch.Tensor, rows: int,
-        mirrored: bool = False,
+        images: int = 1,
     ) -> None:  # fmt: skip
-        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (splits, size)."""
+        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (splits, size);
+        images: of each sample."""
         self._layers, self._weights, self._value, self._partial = layers, weights, flat.value, partial
-        repeats = [2 if mirrored and i > 0 else 1 for i in range(len(layers))]  # rows of a layer for each sample
+        repeats = [images if i > 0 else 1 for i in range(len(layers))]  # rows of a layer for each sample
         self._rows_per_sample = repeats[-1]
         self._outputs, self._gradients = [], []
         for layer, repeat in zip(layers, repeats, strict=True):
@@ -150,16 +159,16 @@ class FusedNetwork:
         self.output, self.grad_output = self._outputs[-1], self._gradients[-1]
         """The last layer's output, float32, and the loss gradient with respect to it, (rows per sample · rows, width).
 
-        The mirror-symmetric actor has two rows for each sample, f(x) and f(M x).
+        A symmetric actor has a row for each image of a sample.
         """
         self._places = tuple((*layer[:4], repeat) for layer, repeat in zip(layers, repeats, strict=True))
         self._biases = tuple((layer.parameter.start, layer.parameter.shape[0]) for layer in layers)
         self._padded = tuple(power_of_two(layer.outputs) for layer in layers)
         self._gradient_tiles = gradient_tiles(layers)
         width = self._padded[0] // self._rows_per_sample
-        filled = self._padded[0] == layers[0].outputs or not mirrored
+        filled = self._padded[0] == layers[0].outputs or images == 1
         self._whole = filled and max(width, *self._padded[1:]) <= MAX_WIDTH
-        """Whether one kernel evaluates all layers; a mirrored first layer must fill its padding."""
+        """Whether one kernel evaluates all layers; a first layer of images must fill its padding."""
 
     @property
     def width(self) -> int:
@@ -174,10 +183,10 @@ class FusedNetwork:
         """
         gather, block = index is not None, 32 if self._layers[0].inputs % 64 else 64
         if self._whole:
-            warps = 8 if self._rows_per_sample == 2 else 4
-            launch(kernels.network_forward, (blocks(rows, 64),), num_warps=warps, num_stages=2)(
+            warps, bm = 4 if self._rows_per_sample == 1 else 8, 32 if self._rows_per_sample > 2 else 64
+            launch(kernels.network_forward, (blocks(rows, bm),), num_warps=warps, num_stages=2)(
                 x, index if gather else x, self._weights, self._value, tuple(self._outputs), rows, self._places,
-                self._biases, self._padded, gather, 64, block,
+                self._biases, self._padded, gather, bm, block,
             )  # fmt: skip
             return self.output
         for i, (layer, place) in enumerate(zip(self._layers, self._places, strict=True)):

@@ -14,7 +14,7 @@ from jumper_warp.rl.fused.kernels.losses import actor_loss, critic_loss
 from jumper_warp.rl.fused.kernels.optimiser import adam_step, prepare_step, sum_partials
 from jumper_warp.rl.fused.networks import FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
-from jumper_warp.rl.mirror import MirrorMap
+from jumper_warp.rl.mirror import Symmetries
 from jumper_warp.rl.networks import ActorCritic, Moments
 from jumper_warp.rl.samples import Batch, RolloutMoments, gae, update_statistics
 
@@ -28,15 +28,15 @@ class FusedUpdate:
 
     def __init__(
         self, collector: FusedCollector, cfg: PpoCfg, model: ActorCritic, optimiser: FlatAdam, fused: FusedModel,
-        coefficients: tuple[torch.Tensor, torch.Tensor], sums: torch.Tensor, obs_mirror: MirrorMap | None = None,
+        coefficients: tuple[torch.Tensor, torch.Tensor], sums: torch.Tensor, symmetries: Symmetries = (),
     ) -> None:  # fmt: skip
         """Allocate the memory of the update; fused: networks of `model`, with the rows of a minibatch at least.
 
         With many ranks gradient and update are separate graphs, between which the gradients are averaged. coefficients:
-        desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`; obs_mirror: map that
-        symmetrises observation statistics.
+        desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`; symmetries: of
+        observation statistics.
         """
-        self._collector, self._cfg, self._model, self._obs_mirror = collector, cfg, model, obs_mirror
+        self._collector, self._cfg, self._model, self._symmetries = collector, cfg, model, symmetries
         self._optimiser, self._flat, self._fused, self._sums = optimiser, optimiser.flat, fused, sums
         self._desired_kl, self._entropy_coef = coefficients
         rollout, device = collector.rollout, self._flat.value.device
@@ -70,7 +70,7 @@ class FusedUpdate:
         advantage, target = (x.flatten() for x in gae(reward, rollout.done, value, cfg.gamma, cfg.lam))
         obs, critic_obs = self._collector.obs_writer.moments(), self._collector.critic_obs_writer.moments()
         local = RolloutMoments(Moments.from_samples(advantage), Moments.from_samples(target), obs, critic_obs)
-        advantage_scaling = update_statistics(model, local, self._obs_mirror, cfg)
+        advantage_scaling = update_statistics(model, local, self._symmetries, cfg)
         normalised = (advantage_scaling.normalise(advantage), model.value_moments.scaling().normalise(target))
         columns = (head[:-1].flatten(), *normalised)
         self._samples[:, 2 * actions + 1 : 2 * actions + 4] = torch.stack(columns, dim=1)
@@ -118,7 +118,7 @@ class FusedUpdate:
         fused, gradient = self._fused, self._flat.all_reduced
         launch(sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
             fused.partial, fused.layout.table, gradient, fused.partial.stride(0), len(gradient), fused.splits,
-            fused.mirrored, SUM_BLOCK,
+            fused.images, SUM_BLOCK,
         )  # fmt: skip
 
     def _actor_gradient(self, samples: torch.Tensor) -> None:
@@ -130,7 +130,7 @@ class FusedUpdate:
             output, fused.mirror, self._samples, self._samples.shape[1], samples, log_std,
             self._collector.rollout.log_std, self._entropy_coef, fused.actor.grad_output, partial[0, layout.noise :],
             partial[0, layout.losses :], partial.stride(0), rows, rows_per_split(rows, fused.splits), len(log_std),
-            self._cfg.clip, fused.mirrored, fused.actor.width, LOSS_ROWS,
+            self._cfg.clip, fused.images, fused.actor.width, LOSS_ROWS,
         )  # fmt: skip
         fused.actor.backward(self._features, rows, samples)
 
@@ -156,7 +156,7 @@ class FusedUpdate:
         launch(adam_step, (blocks(flat.size, ADAM_BLOCK),))(
             flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, self._factors,
             self._fused.weights, self._fused.layout.table, self._sums, flat.size, flat.actor_size, cfg.max_grad_norm,
-            1 << (len(squares) - 1).bit_length(), len(squares), self._fused.mirrored, ADAM_BLOCK,
+            1 << (len(squares) - 1).bit_length(), len(squares), self._fused.images, ADAM_BLOCK,
         )  # fmt: skip
 
     @torch.no_grad()

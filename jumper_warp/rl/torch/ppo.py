@@ -24,12 +24,11 @@ from jumper_warp.rl.torch.rollout import Collector
 
 
 class Losses(NamedTuple):
-    """Losses of PPO, and entropy, left-right asymmetry and KL divergence of the policy, on a minibatch, each ()."""
+    """Losses of PPO, and entropy and KL divergence of the policy, on a minibatch, each ()."""
 
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     value: torch.Tensor  # value loss before weighting [variances of the return]
     entropy: torch.Tensor  # entropy of the policy [nat]
-    asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), 0 for a symmetric network; logged, not minimised
     kl: torch.Tensor  # KL(old ‖ new) [nat]
 
 
@@ -41,7 +40,7 @@ class Ppo(Learner):
         super().__init__(env, cfg)
         self.collector = Collector(env, cfg, self.model)
         self.rollout = self.collector.rollout
-        self.packer = BatchPacker(self.rollout, cfg, self.model, self.symmetry and self.symmetry.obs)
+        self.packer = BatchPacker(self.rollout, cfg, self.model, self.symmetries)
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._capture()
 
@@ -82,7 +81,7 @@ def ppo_losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg:
     The value loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value
     clipped to within `clip` of the rollout's value. old_log_std: (num_actions,) of the policy that acted.
     """
-    mean, difference = model.mean_and_asymmetry(batch.features)
+    mean = model.mean(batch.features)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, model.log_std) - batch.log_prob)
     clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     surrogate = -torch.minimum(batch.advantage * ratio, batch.advantage * clipped).mean()
@@ -94,8 +93,7 @@ def ppo_losses(model: ActorCritic, batch: Batch, old_log_std: torch.Tensor, cfg:
     entropy = (model.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     with torch.no_grad():
         kl = gaussian_kl(batch.mean, old_log_std, mean, model.log_std).mean()
-        asymmetry = difference.square().mean()
-    return Losses(surrogate, loss.mean(), entropy, asymmetry, kl)
+    return Losses(surrogate, loss.mean(), entropy, kl)
 
 
 def optimiser_step(
@@ -114,6 +112,6 @@ def optimiser_step(
     surrogate = losses.surrogate.detach()
     value = losses.value.detach()
     entropy = losses.entropy.detach()
-    step = StepStatistics(surrogate, value, entropy, losses.asymmetry, flat.kl.clone(), norms[0], norms[1], skipped)
+    step = StepStatistics(surrogate, value, entropy, flat.kl.clone(), norms[0], norms[1], skipped)
     sums.add_(torch.nan_to_num(torch.stack([*step, torch.ones_like(skipped)]), nan=0.0, posinf=0.0, neginf=0.0))
     return step

@@ -95,9 +95,9 @@ def network_forward(
     h = acc
     for i in tl.static_range(len(LAYERS)):
         if i > 0:
-            if LAYERS[i][REPEAT] > LAYERS[i - 1][REPEAT]:  # the mirrored half of each row is a row of its own
-                row = tl.program_id(0) * (2 * BM) + tl.arange(0, 2 * BM)
-                h = tl.reshape(h, (2 * BM, width // 2))
+            if LAYERS[i][REPEAT] > LAYERS[i - 1][REPEAT]:  # each image in a row becomes a row of its own
+                row = tl.program_id(0) * (LAYERS[i][REPEAT] * BM) + tl.arange(0, LAYERS[i][REPEAT] * BM)
+                h = tl.reshape(h, (LAYERS[i][REPEAT] * BM, width // LAYERS[i][REPEAT]))
             k = tl.arange(0, PADDED[i - 1] // (LAYERS[i][REPEAT] // LAYERS[i - 1][REPEAT]))
             col = tl.arange(0, PADDED[i])
             mask = (k < LAYERS[i][INPUTS])[:, None] & (col < LAYERS[i][OUTPUTS])[None, :]

@@ -1,10 +1,9 @@
 """Triton kernels of the policy's mean action, and of the losses of actor and critic with their gradients.
 
-The policy is Gaussian: mean action of the network, standard deviations exp(log_std). A mirror-symmetric actor has the
-mean (f(x) + N f(M x)) / 2, with network f, and the left-right mirror maps M of observations and N of actions. A row of
-`samples` is action (num_actions), mean (num_actions), then log probability, value, advantage and return. Samples are
-divided into splits, whose sums are added later in a fixed order. Sums of losses are in places 0 surrogate, 1 value, 2
-entropy, 3 asymmetry and 31 KL of `loss_partial`.
+The policy is Gaussian: mean action of the network, standard deviations exp(log_std). A symmetric actor has the mean of
+network outputs for images of the observation (`jumper_warp.rl.mirror`). A row of `samples` is action (num_actions),
+mean (num_actions), then log probability, value, advantage and return. Samples are divided into splits, whose sums are
+added later in a fixed order. Sums of losses are in places 0 surrogate, 1 value, 2 entropy and 31 KL of `loss_partial`.
 """
 
 import triton
@@ -14,35 +13,33 @@ from jumper_warp.rl.fused.kernels.scalar import HALF_LOG_TAU
 
 
 @triton.jit
-def policy_mean(output, mirror, row, action, mask, width, MIRROR: tl.constexpr):
-    """Return the policy's mean action and its deviation from mirror symmetry, (len(row), len(action)) each.
+def policy_mean(output, mirror, row, action, mask, width, IMAGES: tl.constexpr):
+    """Return the policy's mean action, (len(row), len(action)): the mean of the images of the network's outputs.
 
-    Deviation: f(x) - N f(M x). output: of the network; with MIRROR, rows 2 i and 2 i + 1 are f(x) and f(M x) of row i.
-    mirror: (2, width) order and signs of N.
+    output: of the network, rows IMAGES i and following those of sample i, for each image of its observation. mirror:
+    (IMAGES, 2, width) order and signs of the actions' images.
     """
-    if MIRROR:
-        order = tl.load(mirror + action).to(tl.int32)
-        sign = tl.load(mirror + width + action)
-        base = output + (2 * row).to(tl.int64)[:, None] * width
-        direct = tl.load(base + action[None, :], mask=mask, other=0.0)
-        image = tl.load(base + width + order[None, :], mask=mask, other=0.0) * sign[None, :]
-        return 0.5 * (direct + image), direct - image
-    mean = tl.load(output + row.to(tl.int64)[:, None] * width + action[None, :], mask=mask, other=0.0)
-    return mean, tl.zeros_like(mean)
+    base = output + (IMAGES * row).to(tl.int64)[:, None] * width
+    mean = tl.zeros((row.shape[0], action.shape[0]), tl.float32)
+    for image in tl.static_range(IMAGES):
+        order = tl.load(mirror + 2 * image * width + action).to(tl.int32)
+        sign = tl.load(mirror + (2 * image + 1) * width + action)
+        mean += tl.load(base + image * width + order[None, :], mask=mask, other=0.0) * sign[None, :]
+    return mean / IMAGES
 
 
 @triton.jit
 def actor_loss(
     output, mirror, samples, sample_width, index, log_std, old_log_std, entropy_coef, grad_output, noise_partial,
-    loss_partial, stride, rows, rows_per_split, num_actions, clip, MIRROR: tl.constexpr, WIDTH: tl.constexpr,
+    loss_partial, stride, rows, rows_per_split, num_actions, clip, IMAGES: tl.constexpr, WIDTH: tl.constexpr,
     BM: tl.constexpr,
 ):  # fmt: skip
     """Write PPO's actor losses, and their gradients with respect to the network's output and the exploration noise.
 
     Losses: see `jumper_warp.rl.torch.ppo.ppo_losses`, whose gradient autograd computes there.
-    output, grad_output: (rows, WIDTH), twice the rows with MIRROR, as in `policy_mean`. samples: (…, sample_width), of
-    which the rows `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, asymmetry,
-    KL, sums over each split as in `layers.weight_gradients`.
+    output, grad_output: (IMAGES rows, WIDTH), as in `policy_mean`. samples: (…, sample_width), of which the rows
+    `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, KL, sums over each split
+    as in `layers.weight_gradients`.
     """
     split, action = tl.program_id(0), tl.arange(0, WIDTH)
     first = split * rows_per_split
@@ -51,12 +48,12 @@ def actor_loss(
     new, old = tl.load(log_std + action, mask=used, other=0.0), tl.load(old_log_std + action, mask=used, other=0.0)
     precision = tl.exp(-new)
     grad_noise = tl.zeros((WIDTH,), tl.float32)
-    surrogate, asymmetry, kl = tl.zeros((BM,), tl.float32), tl.zeros((BM,), tl.float32), tl.zeros((BM,), tl.float32)
+    surrogate, kl = tl.zeros((BM,), tl.float32), tl.zeros((BM,), tl.float32)
     for start in range(first, last, BM):
         row = start + tl.arange(0, BM)
         inside = row < last
         mask = inside[:, None] & used[None, :]
-        mean, difference = policy_mean(output, mirror, row, action, mask, WIDTH, MIRROR)
+        mean = policy_mean(output, mirror, row, action, mask, WIDTH, IMAGES)
         sample = samples + tl.load(index + row, mask=inside, other=0) * sample_width
         chosen = tl.load(sample[:, None] + action[None, :], mask=mask, other=0.0)
         old_mean = tl.load(sample[:, None] + num_actions + action[None, :], mask=mask, other=0.0)
@@ -71,19 +68,14 @@ def actor_loss(
         grad = tl.where(objective == objective, grad, objective)  # NaN must reach the gradient, which is then skipped
         grad_noise += tl.sum(tl.where(mask, grad[:, None] * (z * z - 1.0), 0.0), 0)
         grad_mean = grad[:, None] * z * precision[None, :]
-        if MIRROR:
-            order = tl.load(mirror + action).to(tl.int32)
-            sign = tl.load(mirror + WIDTH + action)
-            place = grad_output + (2 * row).to(tl.int64)[:, None] * WIDTH
-            half, image = 0.5 * grad_mean, 0.5 * grad_mean * sign[None, :]
-            tl.store(place + action[None, :], half.to(grad_output.dtype.element_ty), mask=inside[:, None])
-            tl.store(place + WIDTH + order[None, :], image.to(grad_output.dtype.element_ty), mask=inside[:, None])
-        else:
-            place = grad_output + row.to(tl.int64)[:, None] * WIDTH + action[None, :]
-            tl.store(place, grad_mean.to(grad_output.dtype.element_ty), mask=inside[:, None])
+        place = grad_output + (IMAGES * row).to(tl.int64)[:, None] * WIDTH
+        for image in tl.static_range(IMAGES):
+            order = tl.load(mirror + 2 * image * WIDTH + action).to(tl.int32)
+            part = grad_mean * (tl.load(mirror + (2 * image + 1) * WIDTH + action) / IMAGES)[None, :]
+            part = part.to(grad_output.dtype.element_ty)
+            tl.store(place + image * WIDTH + order[None, :], part, mask=inside[:, None])
         shift = tl.where(mask, (old_mean - mean) * precision[None, :], 0.0)
         surrogate -= tl.where(inside, tl.minimum(objective, clipped), 0.0)
-        asymmetry += tl.sum(tl.where(mask, difference * difference, 0.0), 1)
         divergence = new - old + 0.5 * (tl.exp(2.0 * (old - new)) - 1.0)
         kl += tl.sum(tl.where(mask, divergence[None, :] + 0.5 * shift * shift, 0.0), 1)
     is_first = tl.where(split == 0, 1.0, 0.0)
@@ -92,7 +84,6 @@ def actor_loss(
     loss = loss_partial + split * stride
     tl.store(loss, tl.sum(surrogate, 0) / rows)
     tl.store(loss + 2, is_first * tl.sum(tl.where(used, new + HALF_LOG_TAU + 0.5, 0.0), 0))
-    tl.store(loss + 3, tl.sum(asymmetry, 0) / (rows * num_actions))
     tl.store(loss + 31, tl.sum(kl, 0) / rows)
 
 

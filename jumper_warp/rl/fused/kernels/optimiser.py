@@ -1,8 +1,9 @@
 """Triton kernels that add up partial sums of the gradients, and take a step of Adam.
 
 Parameters, gradient and moments are flat vectors, the actor's part first (`jumper_warp.rl.flat`). The layers' kernels
-read a padded copy of the parameters, `weights`, in which a mirror-symmetric actor has its first layer twice; `table`
-has each parameter's places in it. Splits: parts of the samples, added in a fixed order so that results repeat bitwise.
+read a padded copy of the parameters, `weights`, in which a symmetric actor has its first layer once for each image;
+`table` has each parameter's places in it. Splits: parts of the samples, added in a fixed order so that results repeat
+bitwise.
 """
 
 import triton
@@ -15,23 +16,24 @@ LOG_BETA_2 = tl.constexpr(-0.0010005003335835335)
 
 
 @triton.jit
-def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr):
+def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, IMAGES: tl.constexpr, B: tl.constexpr):
     """Add up the gradients of all parts (splits) of the samples in a fixed order; write the flat gradient (total,).
 
     partial: (SPLITS, stride), the gradient of each split.
-    table: (3, total) of `FusedLayout`, the entry that a parameter has in `partial`, that of its mirror image, the sign.
+    table: (2 IMAGES - 1, total) of `FusedLayout`, the entry that a parameter has in `partial`, and another entry with a
+    sign for each further image.
     """
     i = tl.program_id(0) * B + tl.arange(0, B)
     place = partial + tl.load(table + i, mask=i < total, other=0)
     grad = tl.zeros((B,), tl.float32)
     for split in tl.static_range(SPLITS):
         grad += tl.load(place + split * stride)
-    if MIRROR:
-        image = partial + tl.load(table + total + i, mask=i < total, other=0)
+    for image in tl.static_range(1, IMAGES):
+        place = partial + tl.load(table + (2 * image - 1) * total + i, mask=i < total, other=0)
         mirrored = tl.zeros((B,), tl.float32)
         for split in tl.static_range(SPLITS):
-            mirrored += tl.load(image + split * stride)
-        grad += tl.load(table + 2 * total + i, mask=i < total, other=0).to(tl.float32) * mirrored
+            mirrored += tl.load(place + split * stride)
+        grad += tl.load(table + 2 * image * total + i, mask=i < total, other=0).to(tl.float32) * mirrored
     tl.store(gradient + i, grad, mask=i < total)
 
 
@@ -68,14 +70,14 @@ def prepare_step(
 @triton.jit
 def adam_step(
     value, gradient, exp_avg, exp_avg_sq, squares, factors, weights, table, sums, size, actor_size, max_norm,
-    BLOCKS: tl.constexpr, NUM_SQUARES: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr,
+    BLOCKS: tl.constexpr, NUM_SQUARES: tl.constexpr, IMAGES: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Clip the gradient, update parameters and moments by a step of Adam, and add losses and gradient norms to `sums`.
 
-    gradient: (size + 32,), then surrogate, value loss, entropy, asymmetry, and the KL divergence as the last entry.
+    gradient: (size + 32,), then surrogate, value loss, entropy, and the KL divergence as the last entry.
     squares (NUM_SQUARES, 2), factors (2,): of `prepare_step`; BLOCKS: power of two, at least NUM_SQUARES. weights: the
-    copy of the parameters for products; table: (3, size + 32) of `FusedLayout`, the entry of each parameter in
-    `weights`, that of its mirror image, and its sign. sums: (9,) losses, KL, norms of actor and critic, skipped steps,
+    copy of the parameters for products; table: (2 IMAGES - 1, size + 32) of `FusedLayout`, entries of each
+    parameter in `weights`, and signs. sums: (8,) losses, KL, norms of actor and critic, skipped steps,
     steps. A non-finite gradient counts as 0.
     """
     block = tl.arange(0, BLOCKS)
@@ -96,18 +98,18 @@ def adam_step(
     tl.store(value + i, new, mask=mask)
     dtype = weights.dtype.element_ty
     tl.store(weights + tl.load(table + i, mask=mask, other=0), new.to(dtype), mask=mask)
-    if MIRROR:
+    for image in tl.static_range(1, IMAGES):
         total = size + 32
-        sign = tl.load(table + 2 * total + i, mask=mask, other=0).to(tl.float32)
-        place = tl.load(table + total + i, mask=mask, other=0)
+        sign = tl.load(table + 2 * image * total + i, mask=mask, other=0).to(tl.float32)
+        place = tl.load(table + (2 * image - 1) * total + i, mask=mask, other=0)
         tl.store(weights + place, (new * sign).to(dtype), mask=mask & (sign != 0.0))
     if tl.program_id(0) == 0:
         loss = gradient + size
         skipped = tl.where((actor < INFINITY) & (critic < INFINITY), 0.0, 1.0)
-        for j in tl.static_range(4):  # surrogate, value, entropy, asymmetry
+        for j in tl.static_range(3):  # surrogate, value, entropy
             tl.store(sums + j, tl.load(sums + j) + finite_or_zero(tl.load(loss + j)))
-        tl.store(sums + 4, tl.load(sums + 4) + finite_or_zero(tl.load(loss + 31)))
-        tl.store(sums + 5, tl.load(sums + 5) + finite_or_zero(actor))
-        tl.store(sums + 6, tl.load(sums + 6) + finite_or_zero(critic))
-        tl.store(sums + 7, tl.load(sums + 7) + skipped)
-        tl.store(sums + 8, tl.load(sums + 8) + 1.0)
+        tl.store(sums + 3, tl.load(sums + 3) + finite_or_zero(tl.load(loss + 31)))
+        tl.store(sums + 4, tl.load(sums + 4) + finite_or_zero(actor))
+        tl.store(sums + 5, tl.load(sums + 5) + finite_or_zero(critic))
+        tl.store(sums + 6, tl.load(sums + 6) + skipped)
+        tl.store(sums + 7, tl.load(sums + 7) + 1.0)

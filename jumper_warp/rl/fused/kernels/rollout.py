@@ -37,7 +37,7 @@ def observe(
 
 @triton.jit
 def sample_action(
-    output, mirror, log_std, action, samples, rows, num_actions, sample_width, MIRROR: tl.constexpr,
+    output, mirror, log_std, action, samples, rows, num_actions, sample_width, IMAGES: tl.constexpr,
     WIDTH: tl.constexpr, BM: tl.constexpr,
 ):  # fmt: skip
     """Sample actions and write them to `action`; write actions, their means and log probabilities to `samples`.
@@ -47,7 +47,7 @@ def sample_action(
     """
     row, col = tl.program_id(0) * BM + tl.arange(0, BM), tl.arange(0, WIDTH)
     mask = (row < rows)[:, None] & (col < num_actions)[None, :]
-    mean, _ = policy_mean(output, mirror, row, col, mask, WIDTH, MIRROR)
+    mean = policy_mean(output, mirror, row, col, mask, WIDTH, IMAGES)
     log_scale = tl.load(log_std + col, mask=col < num_actions, other=0.0)
     place = action + row[:, None] * num_actions + col[None, :]
     chosen = tl.load(place, mask=mask, other=0.0) * tl.exp(log_scale)[None, :] + mean
