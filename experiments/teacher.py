@@ -29,8 +29,9 @@ from jumper_warp.evaluation.jumps import JumpLog
 from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.predictive_control import PredictiveController
 from jumper_warp.kernels.jump import rewards, terminations
-from jumper_warp.policies.policy import Policy, actor_init_from_policy, save_policy, task_symmetries
+from jumper_warp.policies.policy import Policy, save_policy
 from jumper_warp.policies.spec import make_interface
+from jumper_warp.policies.warm_start import actor_init_from_policy, task_symmetries
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import FROM_STANCE, register_task
 from jumper_warp.rl.actor_init import apply_actor_init

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from jumper_warp.envs.env import Env
-from jumper_warp.policies.policy import actor_init_from_policy, task_symmetries
+from jumper_warp.policies.warm_start import actor_init_from_policy, task_symmetries
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import runner
 from jumper_warp.rl.run_folder import TrainResult

@@ -36,7 +36,7 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
         "rl.logger", "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (
-        "policies.policy", "policies.spec", "policies.catalog", "policies.onnx", "deploy.policy",
+        "policies.policy", "policies.warm_start", "policies.spec", "policies.catalog", "policies.onnx", "deploy.policy",
     )),
     "evaluation": ("Evaluation", (
         "evaluation.run", "evaluation.conditions", "evaluation.skills",

@@ -1,6 +1,7 @@
-"""Trained policies: actor networks with their observation normalisers; loading, saving and warm starts.
+"""Trained policies: actor networks with their observation normalisers; loading and saving.
 
-`Policy.load` reads the project's policies, folders, checkpoints and runs; `save_policy` writes a folder.
+`Policy.load` reads the project's policies, folders, checkpoints and runs; `save_policy` writes a folder. Sections: the
+class; training runs; saving.
 """
 
 from __future__ import annotations
@@ -9,10 +10,8 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,18 +25,12 @@ from jumper_warp.policies.onnx import check_tensors, onnx_bytes, tensors_from_on
 from jumper_warp.policies.spec import PolicyError, PolicyInterface, checksum_entry, make_interface
 from jumper_warp.recipe import Recipe
 from jumper_warp.rl import checkpoint as checkpoints
-from jumper_warp.rl.actor_init import ActorInit, make_actor_init
-from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.mirror import Symmetries, Weights, expand_layers, make_symmetries, symmetries_in
+from jumper_warp.rl.mirror import Weights, expand_layers, symmetries_in
 from jumper_warp.rl.networks import ACTIVATIONS, NORMALISED_LIMIT, VARIANCE_EPS, linear_layers
 from jumper_warp.rl.run_names import CHECKPOINTS
-from jumper_warp.robot.description import RobotDescription
 from jumper_warp.tasks import saving
-from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import mirror_image
 from jumper_warp.tasks.saving import TaskError
 from jumper_warp.utils.checks import check_type
 from jumper_warp.utils.errors import InputError
@@ -49,13 +42,8 @@ FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a poli
 RSL_RL_EPS = 0.01  # rsl-rl adds this to the standard deviation of observations
 RSL_RL_LIMIT = 1.0e6  # Bound of normalised observations, which rsl-rl does not clip
 CURVE = (
-    "iteration",
-    "Perf/elapsed_s",
-    "Train/mean_reward",
-    "Train/mean_episode_length",
-    "Metrics/success",
-    "Metrics/score",
-)
+    "iteration", "Perf/elapsed_s", "Train/mean_reward", "Train/mean_episode_length", "Metrics/success", "Metrics/score"
+)  # fmt: skip
 """Columns of a saved learning curve."""
 CURVE_ROWS = 60  # Maximum number of rows of a saved learning curve, evenly spaced
 
@@ -262,8 +250,7 @@ def _policy_of_checkpoint(state: Json) -> Policy:
     config = parse_json(state["config"], "config")
     model = state["ppo"]["model"]
     layers = _actor_layers(model, "actor.")
-    mirrors = {name: value.view(-1, value.shape[-1]) for name, value in model.items() if name.startswith("mirror_")}
-    layers = expand_layers(layers, symmetries_in(mirrors))
+    layers = expand_layers(layers, symmetries_in(model))
     mean = model["obs_moments.mean"].float()
     std = (model["obs_moments.var"] + VARIANCE_EPS).sqrt().float()
     activation = config["train"]["ppo"]["activation"]
@@ -394,58 +381,3 @@ def export_onnx(policy: Policy, path: Path) -> Path:
     data = onnx_bytes(policy.tensors(), policy.interface, policy.config)
     write_atomically(path, data + checksum_entry(data))
     return path
-
-
-# ---------------------------------------------------------------------- further training
-
-
-def actor_init_from_policy(
-    source: str | Path, task: TaskCfg, cfg: PpoCfg, robot: RobotDescription | None = None
-) -> ActorInit:
-    """Return the initialisation of a training's actor from the policy `source` (see `Policy.load`).
-
-    robot: of the training, by default the Jumper.
-    Observation and joints must agree; action scale, gains, torque limits and time steps may differ.
-    Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
-    observation or joints differ from the task's, or an error of `make_actor_init`.
-    """
-    policy = Policy.load(source)
-    check_interface(policy.interface, interface(task, robot))
-    symmetries = task_symmetries(task, cfg.symmetry)
-    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetries)
-
-
-def task_symmetries(task: TaskCfg, symmetry: str) -> Symmetries:
-    """Return the mirror maps of a task's actor observation and action; symmetry: as in `PpoCfg`.
-
-    Raises InputError: a mirror image is not known.
-    """
-    return make_symmetries(symmetry, partial(mirror_image, task))
-
-
-def check_interface(policy: PolicyInterface, task: Json) -> None:
-    """Raise InputError with the first difference, if a policy and a task differ in observation or joints.
-
-    task: its description by `jumper_warp.tasks.interface`.
-    """
-    for quantity, policy_value, task_value in _compared_values(policy, task):
-        if policy_value != task_value:
-            raise InputError(f"init_policy: {quantity}: the policy has {policy_value}, the task {task_value}")
-
-
-def _compared_values(policy: PolicyInterface, task: Json) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value).
-
-    With another order, scale or default angle the network would get or command other quantities than it has learned.
-    """
-    for label, field in (("observation", "observation_names"), ("action", "joint_names")):
-        for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):
-            yield f"{label} {column}", names[0], names[1]
-    for name, term in policy.observation_layout.items():  # empty if unknown
-        for key, value in term.items():
-            yield f"{key} of {name}", value, task["observation_layout"].get(name, {}).get(key, "none")
-    angles = zip(policy.joint_names, policy.default_joint_pos, task["default_joint_pos"], strict=True)
-    for joint, angle, task_angle in angles:
-        yield f"default angle [rad] of {joint}", round(angle, 6), round(task_angle, 6)
-    yield "limit of observations", policy.observation_limit, RAW_LIMIT
-    yield "limit of observations in standard deviations", policy.normalised_limit, NORMALISED_LIMIT

@@ -70,9 +70,9 @@ class Learner(ABC):
         else:
             keep_freed_memory()
         num_critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
-        self.symmetries = symmetries_of(env, cfg.symmetry)
+        symmetries = symmetries_of(env, cfg.symmetry)
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, self.symmetries,
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs, symmetries,
         ).to(env.device)  # fmt: skip
         self.flat = FlatParameters(self.model)
         self.optimiser = FlatAdam(self.flat, cfg.lr)
@@ -185,10 +185,12 @@ class Learner(ABC):
         The rate is limited to `min_lr` and `max_lr`. Raises InputError: saved with another symmetry; and LookupError or
         RuntimeError: a part is missing, unknown or of another shape.
         """
-        for name, own in self.model.state_dict().items():
-            if name.startswith("mirror_") and not torch.equal(saved := state["model"][name], own.to(saved.device)):
-                raise InputError(f"{name} is for another observation or action")
-        self.model.load_state_dict(state["model"])
+        mirrors = {name: own for name, own in self.model.state_dict().items() if name.startswith("mirror_")}
+        for name, own in mirrors.items():
+            saved = torch.atleast_2d(state["model"][name])  # in earlier versions (n,)
+            if not torch.equal(saved, own.to(saved.device)):
+                raise InputError(f"{name} is for another observation, action or symmetry")
+        self.model.load_state_dict(state["model"] | mirrors)
         self.optimiser.load_state_dict(state["optimiser"])
         self.lr.copy_(state["lr"]).clamp_(self.cfg.min_lr, self.cfg.max_lr)
         self.collector.episode.copy_(state["episode"])

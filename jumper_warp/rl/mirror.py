@@ -110,17 +110,19 @@ def symmetries_of(env: VecEnv, symmetry: str) -> Symmetries:
     if not isinstance(env, MirroredVecEnv):
         raise InputError("symmetry needs an environment that defines mirror images of observation and action")
     symmetries = make_symmetries(symmetry, env.mirror, env.device)
-    sizes = (env.num_obs, env.num_actions)
-    if any((len(each.obs.order), len(each.action.order)) != sizes for each in symmetries):
+    if any((len(each.obs.order), len(each.action.order)) != (env.num_obs, env.num_actions) for each in symmetries):
         raise InputError("the sizes of the mirror images differ from this environment's observation and action")
     return symmetries
 
 
-def symmetries_in(buffers: Mapping[str, torch.Tensor]) -> Symmetries:
-    """Return the symmetries in a model's buffers `mirror_obs_order`, `mirror_obs_signs` and those of action, (k, n)."""
-    if "mirror_obs_order" not in buffers:
+def symmetries_in(model: Mapping[str, torch.Tensor]) -> Symmetries:
+    """Return the symmetries in a model's buffers `mirror_obs_order`, `mirror_obs_signs` and those of action, (k, n).
+
+    In checkpoints of earlier versions, buffers of the one symmetry are (n,).
+    """
+    if "mirror_obs_order" not in model:
         return ()
-    parts = [[buffers[f"mirror_{name}_{part}"] for part in MirrorMap._fields] for name in Symmetry._fields]
+    parts = [[torch.atleast_2d(model[f"mirror_{name}_{p}"]) for p in MirrorMap._fields] for name in Symmetry._fields]
     obs, action = (list(map(MirrorMap, *part)) for part in parts)
     return tuple(map(Symmetry, obs, action))
 

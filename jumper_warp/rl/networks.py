@@ -180,7 +180,7 @@ class ActorCritic(nn.Module):
     @property
     def symmetries(self) -> Symmetries:
         """Mirror maps of the policy, on the device of the weights."""
-        return symmetries_in(dict(self.named_buffers()))
+        return symmetries_in(dict(self.named_buffers(recurse=False)))
 
     def mean(self, features: torch.Tensor) -> torch.Tensor:
         """Return the policy's mean action, (..., num_actions), for normalised observations (..., num_obs)."""

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetries
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
 
 
@@ -78,15 +77,15 @@ def gae(
     return advantage, advantage + value[:-1]
 
 
-def update_statistics(model: ActorCritic, local: RolloutMoments, symmetries: Symmetries, cfg: PpoCfg) -> Scaling:
+def update_statistics(model: ActorCritic, local: RolloutMoments, cfg: PpoCfg) -> Scaling:
     """Update a model's running moments by those of a rollout over all ranks; return the normalisation of advantages.
 
-    Advantages are normalised over the batch of all ranks, with the unbiased variance. local: moments of this rank's
-    samples. symmetries: of the actor, which needs a mean and a variance of observations that mirror images share.
+    Advantages are normalised over the batch of all ranks, with the unbiased variance. A symmetric actor needs a mean
+    and a variance of observations that mirror images share. local: moments of this rank's samples.
     """
     moments = RolloutMoments(*all_reduce_moments(local))
     obs_moments = moments.obs
-    for each in symmetries:
+    for each in model.symmetries:
         symmetric = each.obs.symmetrise_moments(obs_moments.mean, obs_moments.var)
         obs_moments = Moments(*symmetric, obs_moments.count)
     model.obs_moments.update_from_moments(obs_moments)

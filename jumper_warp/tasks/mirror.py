@@ -28,11 +28,10 @@ def mirror_image(task: TaskCfg, what: str, plane: str = "left-right") -> Mirror:
 
     Raises InputError: another text, or the mirror image of a term is not known.
     """
-    if what not in ("observation", "action"):
-        raise InputError(f"mirror needs 'observation' or 'action', got {what!r:.40}")
-    if what == "observation":
-        return mirror_of(task, "actor", plane)
-    return _mirror(MOTORS if plane == "left-right" else FRONT_BACK_MOTORS)
+    motors = {"left-right": MOTORS, "front-back": FRONT_BACK_MOTORS}
+    if what not in ("observation", "action") or plane not in motors:
+        raise InputError(f"expected observation or action, left-right or front-back; got {what!r:.40}, {plane!r:.40}")
+    return mirror_of(task, "actor", plane) if what == "observation" else _mirror(motors[plane])
 
 
 def mirror_of(task: TaskCfg, group: str, plane: str = "left-right") -> Mirror:
@@ -45,8 +44,8 @@ def mirror_of(task: TaskCfg, group: str, plane: str = "left-right") -> Mirror:
     for term in getattr(task.observations, group):
         image = term.mirror if plane == "left-right" else getattr(term.func, "front_back", None)
         if image is None:
-            hint = "; pass it as mirror=" if plane == "left-right" else ""
-            raise InputError(f"{task.name} {group}: the {plane} mirror image of {term.name} is not known{hint}")
+            hint = "mirror=" if plane == "left-right" else "front_back= of mdp.mirror.set_mirror"
+            raise InputError(f"{task.name} {group}: the {plane} image of {term.name} is not known; pass it as {hint}")
         for _ in range(term.options["history"]):
             first = len(columns)
             columns += [column + (first if column > 0 else -first) for column in image]

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from jumper_warp.policies.policy import Policy, actor_init_from_policy, task_symmetries
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.warm_start import actor_init_from_policy, task_symmetries
 from jumper_warp.recipe import Recipe
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.actor_init import apply_actor_init, make_actor_init

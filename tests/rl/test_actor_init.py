@@ -6,7 +6,7 @@ import itertools
 import pytest
 import torch
 
-from jumper_warp.policies.policy import task_symmetries
+from jumper_warp.policies.warm_start import task_symmetries
 from jumper_warp.registry import make_task
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.mirror import contract_layers, expand_layers, symmetries_of

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from jumper_warp.policies.policy import Policy, task_symmetries
+from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.warm_start import task_symmetries
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
@@ -104,6 +105,20 @@ def test_symmetric_actor_stays_symmetric_in_training():
     obs = torch.randn(50, 2)
     assert torch.equal(model.act(-obs), -model.act(obs))
     assert model.act(obs).abs().max() > 0.0
+
+
+@pytest.mark.parametrize("rows", [True, False], ids=["this version", "an earlier one"])
+def test_state_with_mirror_maps_loads(rows):
+    ppo, other = Ppo(PushTask(32), CFG), Ppo(PushTask(32), dataclasses.replace(CFG, symmetry="both"))
+    state = ppo.state_dict()
+    copies = {name: value.clone() for name, value in state["model"].items()}
+    state["model"] = {name: x if rows or not name.startswith("mirror_") else x[0] for name, x in copies.items()}
+    with torch.no_grad():
+        ppo.model.actor[0].weight.zero_()
+    ppo.load_state_dict(state)
+    assert torch.equal(ppo.model.actor[0].weight, copies["actor.0.weight"]) and len(ppo.model.symmetries) == 1
+    with pytest.raises(InputError, match="mirror_obs_order is for another observation, action or symmetry"):
+        other.load_state_dict(state)
 
 
 def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):

@@ -127,6 +127,14 @@ def test_mirroring_twice_is_the_identity():
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)
 
 
+@pytest.mark.parametrize("wrong", [("velocity",), ("action", "up-down"), ("observation", "front-back")])
+def test_refuses_an_unknown_mirror_image(wrong):
+    with pytest.raises(
+        InputError, match=r"expected observation or action, left-right|front-back image of command is not"
+    ):
+        mirror_image(task(), *wrong)
+
+
 @wp.func
 def sideways(robot: RobotView, state: Any) -> wp.vec4:
     """Return zeros."""

@@ -112,10 +112,8 @@ class FusedModel:
     def __init__(self, model: ActorCritic, flat: FlatParameters, rows: int, dtype: torch.dtype) -> None:
         """Allocate networks for at most `rows` samples; dtype: of weights, activations and their gradients."""
         symmetries, device = model.symmetries, flat.value.device
-        obs, action = (
-            images((getattr(each, name) for each in symmetries), size)
-            for name, size in (("obs", len(model.obs_moments.mean)), ("action", len(model.log_std)))
-        )
+        obs = images((each.obs for each in symmetries), len(model.obs_moments.mean))
+        action = images((each.action for each in symmetries), len(model.log_std))
         self.images = len(obs.order)
         """Number of images of an observation for which the actor's network is evaluated."""
         self.layout = layout = FusedLayout(flat, obs)
@@ -127,11 +125,11 @@ class FusedModel:
         networks = (self.weights, self.partial, rows)
         self.actor = FusedNetwork(layout.actor, flat, *networks, self.images)
         self.critic = FusedNetwork(layout.critic, flat, *networks)
-        self.mirror = torch.zeros(self.images, 2, self.actor.width)
+        padding = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)])
+        mirror = padding.repeat(self.images, 1, 1)
+        mirror[:, :, : len(model.log_std)] = torch.stack([*action], dim=1)
+        self.mirror = mirror.to(device)
         """Order and signs of the action's images, padded, (images, 2, width of the actor's output)."""
-        self.mirror[:] = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)])
-        self.mirror[:, :, : len(model.log_std)] = torch.stack([*action], dim=1)
-        self.mirror = self.mirror.to(device)
 
     def copy_weights(self) -> None:
         """Copy the current parameters of actor and critic to the padded vector that the kernels read."""
@@ -145,8 +143,10 @@ class FusedNetwork:
         self, layers: list[Layer], flat: FlatParameters, weights: torch.Tensor, partial: torch.Tensor, rows: int,
         images: int = 1,
     ) -> None:  # fmt: skip
-        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (splits, size);
-        images: of each sample."""
+        """Allocate activations.
+
+        weights: (size of the layout,) copy of the parameters; partial: (splits, size); images: number of each sample's.
+        """
         self._layers, self._weights, self._value, self._partial = layers, weights, flat.value, partial
         repeats = [images if i > 0 else 1 for i in range(len(layers))]  # rows of a layer for each sample
         self._rows_per_sample = repeats[-1]

@@ -30,7 +30,7 @@ class FusedPpo(Learner):
         self.rollout = self.collector.rollout
         self.fused = FusedUpdate(
             self.collector, cfg, self.model, self.optimiser, self.networks, (self._desired_kl, self._entropy_coef),
-            self._sums, self.symmetries,
+            self._sums,
         )  # fmt: skip
         self._capture(epochs=world_size() == 1)
 

@@ -14,7 +14,6 @@ from jumper_warp.rl.fused.kernels.losses import actor_loss, critic_loss
 from jumper_warp.rl.fused.kernels.optimiser import adam_step, prepare_step, sum_partials
 from jumper_warp.rl.fused.networks import FusedModel, blocks, compile_side_by_side, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
-from jumper_warp.rl.mirror import Symmetries
 from jumper_warp.rl.networks import ActorCritic, Moments
 from jumper_warp.rl.samples import Batch, RolloutMoments, gae, update_statistics
 
@@ -28,15 +27,14 @@ class FusedUpdate:
 
     def __init__(
         self, collector: FusedCollector, cfg: PpoCfg, model: ActorCritic, optimiser: FlatAdam, fused: FusedModel,
-        coefficients: tuple[torch.Tensor, torch.Tensor], sums: torch.Tensor, symmetries: Symmetries = (),
+        coefficients: tuple[torch.Tensor, torch.Tensor], sums: torch.Tensor,
     ) -> None:  # fmt: skip
         """Allocate the memory of the update; fused: networks of `model`, with the rows of a minibatch at least.
 
         With many ranks gradient and update are separate graphs, between which the gradients are averaged. coefficients:
-        desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`; symmetries: of
-        observation statistics.
+        desired KL and weight of the entropy bonus, () each; sums: of the statistics, as in `Ppo`.
         """
-        self._collector, self._cfg, self._model, self._symmetries = collector, cfg, model, symmetries
+        self._collector, self._cfg, self._model = collector, cfg, model
         self._optimiser, self._flat, self._fused, self._sums = optimiser, optimiser.flat, fused, sums
         self._desired_kl, self._entropy_coef = coefficients
         rollout, device = collector.rollout, self._flat.value.device
@@ -70,7 +68,7 @@ class FusedUpdate:
         advantage, target = (x.flatten() for x in gae(reward, rollout.done, value, cfg.gamma, cfg.lam))
         obs, critic_obs = self._collector.obs_writer.moments(), self._collector.critic_obs_writer.moments()
         local = RolloutMoments(Moments.from_samples(advantage), Moments.from_samples(target), obs, critic_obs)
-        advantage_scaling = update_statistics(model, local, self._symmetries, cfg)
+        advantage_scaling = update_statistics(model, local, cfg)
         normalised = (advantage_scaling.normalise(advantage), model.value_moments.scaling().normalise(target))
         columns = (head[:-1].flatten(), *normalised)
         self._samples[:, 2 * actions + 1 : 2 * actions + 4] = torch.stack(columns, dim=1)

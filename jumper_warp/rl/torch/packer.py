@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetries
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, gaussian_log_prob
 from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, gae, update_statistics
 from jumper_warp.rl.torch.rollout import RolloutBuffer
@@ -39,9 +38,8 @@ class Scalings(NamedTuple):
 class BatchPacker:
     """Converter of a rollout to PPO's training samples, with advantages and returns, one per row of `rows`."""
 
-    def __init__(self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, symmetries: Symmetries = ()) -> None:
-        """Allocate memory for the training samples of a rollout; symmetries: of the observation statistics."""
-        self._symmetries = symmetries
+    def __init__(self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic) -> None:
+        """Allocate memory for the training samples of a rollout."""
         self._rollout, self._cfg, self._model = rollout, cfg, model
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
@@ -57,7 +55,7 @@ class BatchPacker:
         moments = (model.obs_moments, model.critic_moments, model.value_moments)
         scalings = Scalings(*(each.scaling() for each in moments))  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
-        advantage_scaling = update_statistics(model, estimates.moments, self._symmetries, self._cfg)
+        advantage_scaling = update_statistics(model, estimates.moments, self._cfg)
         self._write_rows(scalings, estimates, advantage_scaling)
         self.old_log_std.copy_(self._rollout.log_std)
 

@@ -40,7 +40,7 @@ class Ppo(Learner):
         super().__init__(env, cfg)
         self.collector = Collector(env, cfg, self.model)
         self.rollout = self.collector.rollout
-        self.packer = BatchPacker(self.rollout, cfg, self.model, self.symmetries)
+        self.packer = BatchPacker(self.rollout, cfg, self.model)
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._capture()
 

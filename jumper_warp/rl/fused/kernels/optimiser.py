@@ -76,9 +76,9 @@ def adam_step(
 
     gradient: (size + 32,), then surrogate, value loss, entropy, and the KL divergence as the last entry.
     squares (NUM_SQUARES, 2), factors (2,): of `prepare_step`; BLOCKS: power of two, at least NUM_SQUARES. weights: the
-    copy of the parameters for products; table: (2 IMAGES - 1, size + 32) of `FusedLayout`, entries of each
-    parameter in `weights`, and signs. sums: (8,) losses, KL, norms of actor and critic, skipped steps,
-    steps. A non-finite gradient counts as 0.
+    copy of the parameters for products; table: (2 IMAGES - 1, size + 32) of `FusedLayout`, entries of each parameter in
+    `weights`, and signs. sums: (8,) losses, KL, norms of actor and critic, skipped steps, steps. A non-finite gradient
+    counts as 0.
     """
     block = tl.arange(0, BLOCKS)
     actor = tl.sqrt(tl.sum(tl.load(squares + 2 * block, mask=block < NUM_SQUARES, other=0.0), 0))
